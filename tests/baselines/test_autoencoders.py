@@ -61,9 +61,7 @@ def test_the_vae_samples_in_training_and_takes_the_mean_otherwise(seeded, losses
 
 def test_beta_scales_the_normal_divergence_and_nothing_else(seeded, losses):
     model = seeded(BetaVae, SMALL).eval()
-    one, four = (
-        losses(model, IMAGES, BetaVaeConfig(objective=BetaObjective(beta=beta))) for beta in (1.0, 4.0)
-    )
+    one, four = (losses(model, IMAGES, BetaVaeConfig(objective=BetaObjective(beta=by))) for by in (1.0, 4.0))
     torch.testing.assert_close(four["kl"], 4 * one["kl"])
     torch.testing.assert_close(four["reconstruction"], one["reconstruction"])
     mean, log_variance = model.posterior(IMAGES)

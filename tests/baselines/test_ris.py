@@ -126,9 +126,7 @@ def test_classes_become_parts(tmp_path):
         Image.fromarray(mask).save(tmp_path / "masks" / f"{number}.png")
     (tmp_path / "masks" / "classes.txt").write_text("\n".join(MASK_CLASSES))
     images = read_images(tmp_path / "images", 32)
-    inputs, parts, names = ris.masked_rows(
-        images, ris.RisConfig(image_size=32, masks=str(tmp_path / "masks"))
-    )
+    inputs, parts, names = ris.masked_rows(images, ris.RisConfig(image_size=32, masks=f"{tmp_path}/masks"))
     assert len(inputs) == len(parts) == 8 and names == ("background", "nose", "eyes")
     assert parts[0, :, ::8, 0].tolist() == [[0, 0, 0, 1], [0, 0, 1, 0], [1, 1, 0, 0]]
 

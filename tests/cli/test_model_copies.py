@@ -54,9 +54,7 @@ def test_mean_only_moves_features_to_a_mean_of_zero_and_no_distance(folder, tmp_
     assert run("whiten", folder, tmp_path / "mine", words=words) == 0
     one, two = derender.load(KNOWN), derender.load(tmp_path / "mine")
     images = torch.from_numpy(read_images(folder, 64, limit=24).images).float() / 255
-    before, after = (
-        model.features_from(model.activations(images))["albedo"][:, :192] for model in (one, two)
-    )
+    before, after = (net.features_from(net.activations(images))["albedo"][:, :192] for net in (one, two))
     assert before.mean(dim=0).norm() > 0.05 * before.std(dim=0).norm()
     assert after.mean(dim=0).norm() < 1e-4 * before.norm(dim=1).mean()
     torch.testing.assert_close(torch.cdist(after, after), torch.cdist(before, before), atol=1e-2, rtol=1e-3)

@@ -25,9 +25,7 @@ def images(*names: str) -> dict[str, None]:
 CHIP = "20170110183726390.jpg"
 UTKFACE = images("a/100_1_0_" + CHIP, "a/24_0_1_2017011622022 .jpg", "a/39_1_" + CHIP, "a/55_0_9_" + CHIP)
 LFW = images("lfw/Ann_Lee/Ann_Lee_0001.jpg", "lfw/Bo/Bo_0001.jpg", "lfw/Cy_X/Cy_X_0001.jpg")
-YALE = images(
-    *(f"CroppedYale/yaleB02/yaleB02_P00A{light}.pgm" for light in ("+000E+00", "-050E+00", "+120E-20"))
-)
+YALE = images(*(f"CroppedYale/yaleB02/yaleB02_P00A{at}.pgm" for at in ("+000E+00", "-050E+00", "+120E-20")))
 VIEW_1 = {"peopleDevTrain.txt": "2\nAnn_Lee\t1\nOther\t3\n", "peopleDevTest.txt": "1\nBo\t1\n"}
 ALIGNED = images(*(f"img_align_celeba/00000{row}.jpg" for row in (1, 2, 3)))
 ATTRIBUTES = {"list_attr_celeba.txt": "2\nBald Smiling \n000001.jpg -1  1\n000002.jpg  1 -1\n"}

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from derender.data import (
-    MASK_CLASSES,
-    list_images,
-    read_ground_truth,
-    read_masks,
-    split_indices,
-)
+from derender.data import MASK_CLASSES, list_images, read_ground_truth, read_masks, split_indices
 from derender.data.synthetic.synthetic_set import camera_rotation_and_light
 
 

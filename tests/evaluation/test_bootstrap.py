@@ -58,9 +58,7 @@ def test_paired_differences_see_what_separate_intervals_do_not():
 
 def test_the_strongest_control_is_the_one_to_beat():
     rows = [ScoredRow("ours", False, 1, {"nmi": estimate([0.5], np.full(10, 0.5))})]
-    rows += [
-        ScoredRow(name, True, 1, {"nmi": constant(value, 10)}) for name, value in (("a", 0.4), ("b", 0.6))
-    ]
+    rows += [ScoredRow(name, True, 1, {"nmi": constant(by, 10)}) for name, by in (("a", 0.4), ("b", 0.6))]
     verdict = with_verdicts(rows)[0].versus["nmi"]
     assert verdict.rival == "b" and verdict.value == pytest.approx(-0.1) and not verdict.above
     assert with_verdicts(rows[:1])[0].versus == {}

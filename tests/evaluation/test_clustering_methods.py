@@ -113,9 +113,7 @@ def test_finch_levels_are_nested_and_scored_beside_chance():
 
 def test_forty_attributes_cost_one_tree(monkeypatch, tmp_path):
     built = []
-    monkeypatch.setattr(
-        clustering_methods, "ward_tree", lambda features: built.append(1) or ward_tree(features)
-    )
+    monkeypatch.setattr(clustering_methods, "ward_tree", lambda of: built.append(1) or ward_tree(of))
     features = groups(40, 0)
     cuts = clusterings(features, [2] * 40 + [5], "ward", memory=Memory(tmp_path))
     assert len(built) == 1 and sorted(cuts) == [2, 5]

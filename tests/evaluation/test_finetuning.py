@@ -88,9 +88,7 @@ def test_both_objectives_reach_the_encoders(pictures, tmp_path):
         )
         assert set(losses.terms) - {"target"} <= set(RENDERING_TERMS)
         losses.total.backward()
-        found = [
-            model.model.nets[name].encoder.convolutions[0].weight.grad for name in ("geometry", "albedo")
-        ]
+        found = [model.model.nets[one].encoder.convolutions[0].weight.grad for one in ("geometry", "albedo")]
         return losses.total.item(), torch.stack(found)
 
     target, rendering = gradient(1.0, 0.0), gradient(1e-12, 1.0)

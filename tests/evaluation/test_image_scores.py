@@ -25,9 +25,7 @@ def test_lower_scores_are_better_by_the_controls_surplus():
     assert better.rival == "plane" and better.above and better.low == pytest.approx(0.1, abs=1e-6)
     assert worse.value == pytest.approx(-0.1) and not worse.above and worse.high < 0
     assert plane.control and not plane.versus
-    near = image_rows(
-        {name: {"error": ERROR + add} for name, add in (("m", 0), ("far", 3), ("near", 1))}, ONE
-    )
+    near = image_rows({name: {"error": ERROR + by} for name, by in (("m", 0), ("far", 3), ("near", 1))}, ONE)
     assert near[0].versus["error"].rival == "near"  # the strongest control has the lowest error
 
 

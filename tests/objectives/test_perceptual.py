@@ -42,9 +42,7 @@ def test_every_picture_has_a_mask_of_its_own(generator):
     sigma = 0.3 + torch.rand(2, 1, 4, 4, generator=generator)
     mask = torch.zeros(2, 4, 4)
     mask[0, :, :2], mask[1, :, 1:] = 1, 1
-    each = [
-        perceptual_loss(*(value[n : n + 1] for value in (prediction, target, mask, sigma))) for n in (0, 1)
-    ]
+    each = [perceptual_loss(*(one[n : n + 1] for one in (prediction, target, mask, sigma))) for n in (0, 1)]
     together = perceptual_loss(prediction, target, mask, sigma)
     assert together.item() == pytest.approx((8 * each[0] + 12 * each[1]).item() / 20, rel=1e-5)
 

@@ -122,9 +122,7 @@ def test_no_crop_takes_the_place_of_another_or_of_a_photograph(two_faces, tmp_pa
     assert len({row["file"].casefold() for row in rows}) == len(rows) == 10
     for row in rows:
         with Image.open(out / row["file"]) as crop, Image.open(two_faces / row["photo"]) as photo:
-            assert (
-                np.abs(np.asarray(crop)[8, 8] - np.asarray(photo.convert("RGB"))[8, 8].astype(int)).max() < 3
-            )
+            assert np.abs(np.asarray(crop)[8, 8] - np.asarray(photo.convert("RGB"), int)[8, 8]).max() < 3
     before = {file: file.read_bytes() for file in two_faces.rglob("*") if file.is_file()}
     for place in (two_faces, two_faces / "b"):
         for overwrite in (False, True):

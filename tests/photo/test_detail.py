@@ -88,9 +88,7 @@ def test_a_photograph_in_the_mirror_is_drawn_in_the_mirror():
 def test_hidden_surface_comes_from_the_mirror_image():
     """The photograph has a colour that the model does not know; what is hidden shows it."""
     scene = bump(camera=(0.0, math.radians(40), 0.0, 0.0, 0.0, 0.0))
-    photo = textured(
-        scene.with_parameters(albedo=scene.albedo * torch.tensor([0.2, 1.0, 0.2])[:, None, None])
-    )
+    photo = textured(scene.with_parameters(albedo=scene.albedo * torch.tensor([0.2, 1, 0.2])[:, None, None]))
     turned = scene.with_parameters(camera=-scene.camera)
     seen = PhotoDetail(photo, scene, FOV)(turned).image[0]
     middle = seen[:, LARGE // 3 : -LARGE // 3, LARGE // 3 : -LARGE // 3]
@@ -110,9 +108,7 @@ def test_several_scenes_are_drawn_as_one_by_one():
     scene = bump()
     draw = PhotoDetail(textured(scene), scene, FOV)
     lights = torch.tensor([[0.3, 0.6, 0.1, -0.7], [0.5, 0.3, -0.2, 0.2]])
-    both = draw(
-        scene.map(lambda value: value.expand(2, *value.shape[1:])).with_parameters(light=lights)
-    ).image
+    both = draw(scene.map(lambda one: one.expand(2, *one.shape[1:])).with_parameters(light=lights)).image
     for row in range(2):
         one = draw(scene.with_parameters(light=lights[row : row + 1])).image[0]
         torch.testing.assert_close(both[row], one, atol=1e-5, rtol=0)

@@ -38,9 +38,7 @@ def scene(
 
 def camera(dtype: torch.dtype = torch.float64, **parts: float) -> Tensor:
     """One camera (1, 6) by named parts, the rest zero."""
-    return torch.tensor(
-        [[parts.get(name, 0.0) for name in ("rx", "ry", "rz", "tx", "ty", "tz")]], dtype=dtype
-    )
+    return torch.tensor([[parts.get(one, 0.0) for one in ("rx", "ry", "rz", "tx", "ty", "tz")]], dtype=dtype)
 
 
 def rays(height: int, width: int, dtype: torch.dtype = torch.float64) -> Tensor:

@@ -300,8 +300,6 @@ def test_half_precision_and_autocast_leave_geometry_in_float32(backend, generato
 
 
 def test_an_empty_batch_gives_an_empty_batch(backend):
-    result = render(
-        torch.ones(0, 6, 5), torch.ones(0, 3, 6, 5), torch.ones(0, 4), torch.ones(0, 6), FOV_DEG, backend
-    )
+    result = render(*map(torch.ones, ((0, 6, 5), (0, 3, 6, 5), (0, 4), (0, 6))), FOV_DEG, backend)
     assert isinstance(result, Rendering)
     assert result.image.shape == (0, 3, 6, 5)

@@ -65,9 +65,7 @@ def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generato
     )  # fmt: skip
     swaps = swapped_factors(model, one, other)
     assert list(swaps.stills) == [f"its {row.name}" for row in model.factors]
-    drawn = {
-        np.asarray(still).tobytes() for still in (*swaps.stills.values(), swaps.inputs["reconstruction"])
-    }
+    drawn = {np.asarray(one).tobytes() for one in (*swaps.stills.values(), swaps.inputs["reconstruction"])}
     assert len(drawn) == len(swaps.stills) + 1  # every factor changes the image
     parameter = next(row.parameter for row in model.factors if row.name == "light")
     last = list(relit(model, one, like=other).numbers.values())[-1]

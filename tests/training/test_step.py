@@ -9,13 +9,7 @@ from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1, photometric_loss
 from derender.training.config import ObjectiveSettings, TrainConfig
 from derender.training.derender_task import DerenderStep
-from derender.training.step import (
-    cycle_loss,
-    fill_uncovered,
-    own_share,
-    perturb_one_factor,
-    training_step,
-)
+from derender.training.step import cycle_loss, fill_uncovered, own_share, perturb_one_factor, training_step
 from derender.training.task import compute_step
 
 TEMPLATE = ObjectiveSettings(perceptual="none", curvature_weight=0.0, template_share=0.1, release_share=0.2)

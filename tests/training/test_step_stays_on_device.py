@@ -27,9 +27,7 @@ class ReadBack(TorchDispatchMode):
         self.seen = seen
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        waits = any(
-            word in str(func) for word in ("_local_scalar_dense", "nonzero", "masked_select", "unique")
-        )
+        waits = any(one in str(func) for one in ("_local_scalar_dense", "nonzero", "masked_select", "unique"))
         by_mask = "index" in str(func) and any(
             isinstance(index, torch.Tensor) and index.dtype == torch.bool
             for given in args if isinstance(given, (list, tuple)) for index in given

@@ -8,13 +8,13 @@ else that escapes, an input that takes longer than ``SLOW_SECONDS``, and one tha
 Each kind is told once, with the input; the same seed makes the same inputs again.
 """
 
-import argparse
 import resource
 import sys
 import tempfile
 import time
 import traceback
 import warnings
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -111,7 +111,7 @@ def fuzz(target: Target, inputs: int, number: int) -> Found:
     return found
 
 
-def run(asked: argparse.Namespace) -> int:
+def run(asked: Namespace) -> int:
     """The script."""
     limited_and_quiet()
     total = findings = 0
@@ -125,9 +125,7 @@ def run(asked: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="targets whose name holds this")

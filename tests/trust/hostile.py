@@ -129,9 +129,7 @@ def run_all() -> int:
         place = Path(folder)
         os.environ["DERENDER_CACHE"] = str(place / "cache")
         bench, hostile = Bench(place), write_hostile(place / "hostile")
-        print(
-            len(hostile.readable), "odd images,", len(hostile.unreadable), "that cannot be read", flush=True
-        )
+        print(len(hostile.readable), "odd images,", len(hostile.unreadable), "that are broken", flush=True)
         broken = labelled(place / "classes", hostile)
         words = {
             "READS": f"--model {MODEL} --data DATA --device cpu",

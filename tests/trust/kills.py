@@ -9,7 +9,6 @@ command is given again until it comes through, and what it leaves must be that o
 bit. The disk is a small tmpfs, filled up, where one may be mounted (root); elsewhere a limit on file sizes.
 """
 
-import argparse
 import ctypes
 import importlib
 import json
@@ -23,6 +22,7 @@ import sys
 import tempfile
 import threading
 import time
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -313,7 +313,7 @@ def small_disk(mount: bool) -> Iterator[tuple[Path, bool]]:
                 subprocess.run(["umount", "-l", folder], check=False)
 
 
-def run(given: argparse.Namespace) -> int:
+def run(given: Namespace) -> int:
     """The script."""
     embedding_module.PART_ROWS = 8
     faults: list[str] = []
@@ -347,9 +347,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=30, help="of each command")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", type=int, default=40, help="in the data set")

@@ -7,7 +7,6 @@ its light; memory, descriptors, threads and files are sampled. The first quarter
 its median in the last quarter exceeds that of the second by more than its bound. Linux only.
 """
 
-import argparse
 import http.client
 import json
 import os
@@ -16,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -127,9 +127,7 @@ def soak(place: Path, minutes: float, clients: int, every_seconds: float, model:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--clients", type=int, default=8)
     parser.add_argument("--every", type=float, default=5.0, help="seconds between samples")

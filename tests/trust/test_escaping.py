@@ -74,9 +74,7 @@ def test_run(evil, tmp_path):
     text = run.config.read_text()
     run.config.write_text(text.replace("preset: small", f"preset: {json.dumps(evil)}"))
     for images in (8, 16):
-        append_metrics(
-            run, {"kind": "train", "images": images, "seconds": 1.0, evil: 0.5, "l1": 0.5 / images}
-        )
+        append_metrics(run, {"kind": "train", "images": images, "seconds": 1, evil: 0.5, "l1": 0.5 / images})
         append_metrics(run, {"kind": evil, "images": images, "text": evil})
         append_metrics(run, {"kind": "note", "images": images, "text": evil})
     append_metrics(run, {"kind": "collapse", "images": 16, evil: evil})

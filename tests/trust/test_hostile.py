@@ -155,9 +155,7 @@ def test_a_damaged_heic_or_one_that_claims_gigapixels_is_one_line_and_takes_no_m
     whole = encoded(smooth(0, (256, 192)), "HEIF", quality=80)
     assert read_image(whole, 16).shape == (3, 16, 16)
     size = whole.index(b"ispe") + 8  # of the box: version, flags, width, height
-    claims = {
-        side: whole[:size] + struct.pack(">II", side, side) + whole[size + 8 :] for side in (13_000, 60_000)
-    }
+    claims = {n: whole[:size] + struct.pack(">II", n, n) + whole[size + 8 :] for n in (13_000, 60_000)}
     cut = [whole[: len(whole) * part // 8] for part in range(1, 8)]
     other = [whole[:32] + encoded(smooth(1), "JPEG"), whole[:32], whole[:size]]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -79,9 +79,7 @@ def spoil_confidence(name: str, model: Derenderer, bad: float) -> None:
 
 def spoil_rendering(name: str, model: Derenderer, bad: float) -> None:
     plain = model.renderer
-    model.renderer = as_renderer(
-        lambda scene, fov_deg: spoil_field(plain(scene, fov_deg), name, bad), "lambert"
-    )
+    model.renderer = as_renderer(lambda scene, fov: spoil_field(plain(scene, fov), name, bad), "lambert")
 
 
 STAGES = {
@@ -101,9 +99,7 @@ def seen(watch: FiniteWatch, result: StepLosses) -> tuple[Finding, ...]:
 
 def broken_gradient(model: Derenderer) -> str | None:
     names, largest = largest_gradients(model)
-    return next(
-        (name for name, size in zip(names, largest.tolist(), strict=True) if not isfinite(size)), None
-    )
+    return next((name for name, one in zip(names, largest.tolist(), strict=True) if not isfinite(one)), None)
 
 
 def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None = None) -> str:

@@ -35,9 +35,7 @@ def test_images_are_their_maps_put_together(kind, plain):
     with_effect = made(kind)
     assert tuple(with_effect.effects) == EFFECTS and not plain.effects
     for name in ("depth", "normal", "albedo", "mask", "light", "camera"):
-        assert np.array_equal(getattr(with_effect, name), getattr(plain, name)), (
-            "an effect changes light alone"
-        )
+        assert np.array_equal(getattr(with_effect, name), getattr(plain, name)), "only light changes"
     maps = {name: value[:, None] for name, value in with_effect.effects.items()}
     air = with_effect.labels["haze_airlight"][:, None, None, None] if kind == "haze" else 0.0
     lit = with_effect.albedo / 255 * maps["shading"] + maps["highlight"]

@@ -74,9 +74,7 @@ def test_where_the_weights_come_from(data, model, before):
     def starts(name):
         return [encoder.levels[0][0].weight for encoder in built[name].encoders]
 
-    assert torch.equal(starts("geometry")[0], ours["geometry"]) and torch.equal(
-        starts("albedo")[0], ours["albedo"]
-    )
+    assert all(torch.equal(starts(name)[0], ours[name]) for name in ("geometry", "albedo"))
     for name in ("joint-whole", "joint", "joint-frozen"):
         assert torch.equal(starts(name)[0], ours["geometry"]) and torch.equal(starts(name)[1], ours["albedo"])
     fresh = [*starts("random"), *starts("joint-random"), *starts("joint-random-frozen")]

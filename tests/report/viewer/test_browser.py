@@ -37,9 +37,7 @@ def address(rendered) -> Iterator[str]:
     model = load("rendered-faces-64")
     made = {"fit_steps": model.fitting.settings.steps}
     table = FeatureTable(("a<b>.png", "b.png", "c.png"), embed_images(model, rendered), {}, made)
-    examples = [
-        Example(f"<i>face</i> {number}", image.transpose(1, 2, 0)) for number, image in enumerate(rendered)
-    ]
+    examples = [Example(f"<i>face</i> {at}", one.transpose(1, 2, 0)) for at, one in enumerate(rendered)]
     viewer = Viewer(Studio(model, "rendered-faces-64", Shelf(3), table=table), examples, Gallery(table))
     with serving(Application(viewer)) as url:
         yield url
