@@ -2,12 +2,10 @@
 
 from derender.report.comparison import protocol_picture, protocol_table, scores_from, set_tables
 
-NAN = None
-
 
 def question(name: str, **accuracies: float) -> dict:
     def row(value: float, control: bool) -> dict:
-        one = {"value": value, "low": value - 0.1, "high": value + 0.1, "spread": NAN}
+        one = {"value": value, "low": value - 0.1, "high": value + 0.1, "spread": None}
         scores = dict.fromkeys(("accuracy", "f1", "nmi", "hungarian", "ari"), one)
         rival = {"rival": "pixels", "value": 0.1, "low": 0.05, "high": 0.2, "above": True}
         versus = {} if control else {"accuracy": rival}
@@ -50,18 +48,17 @@ def test_rows_are_methods_then_controls_and_what_failed_keeps_its_place():
 
 def test_few_labels_show_one_head_and_the_most_labels():
     def part(head: str, labels: int, value: float) -> dict:
-        one = {"value": value, "low": NAN, "high": NAN, "spread": NAN}
+        one = {"value": value, "low": None, "high": None, "spread": None}
         scores = dict.fromkeys(("accuracy", "balanced_accuracy", "average_precision"), one)
         row = {"control": False, "runs": 1, "scores": scores, "versus": {}}
         return {"head": head, "labels": labels, "rows": {"ours": row}}
 
-    parts = [part(head, labels, 0.5) for head in ("linear", "logistic") for labels in (100, 500)]
+    asked = [(head, labels) for head in ("linear", "logistic") for labels in (100, 500)]
+    parts = [part(head, labels, 0.5) for head, labels in asked]
     told = {"name": "celeba", "protocol": "linear", "kind": "labels", "names": ["a", "b"]}
     told |= {"n_test": 5, "seeds": [0]}
     scores = scores_from({**told, "parts": parts}, {}, {})
-    assert [(one.head, one.count) for one in scores] == [
-        *(("linear", 100), ("linear", 500), ("logistic", 100), ("logistic", 500))
-    ]
+    assert [(one.head, one.count) for one in scores] == asked
     table = protocol_table(scores, ["ours"])
     names = [column.name for column in table.columns[:2]]
     assert names == ["celeba, 100 labels: balanced", "celeba, 500 labels: balanced"]

@@ -13,14 +13,9 @@ def scores(*cells: float | None, best: str | None = "high") -> ScoreTable:
 
 
 def test_page_has_every_table_a_chart_settings_and_what_failed():
-    page = comparison_page(
-        "Clustering & more",
-        [scores(0.5, 0.4), scores(0.3)],
-        lead=f"By {EVIL}.",
-        facts={"seeds": "0, 1", "data": EVIL},
-        failed=["pixels: the data is gone"],
-    )
-    html = page.html()
+    more = {"facts": {"seeds": "0, 1", "data": EVIL}, "failed": ["pixels: the data is gone"]}
+    tables = [scores(0.5, 0.4), scores(0.3)]
+    html = comparison_page("Clustering & more", tables, lead=f"By {EVIL}.", **more).html()
     assert html.count("<table") == 2 and html.count("<svg") == 2
     assert "sortable" in html and 'aria-label="accuracy of' in html
     assert "pixels: the data is gone" in html and "<dt>seeds</dt><dd>0, 1</dd>" in html

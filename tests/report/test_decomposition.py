@@ -1,6 +1,7 @@
 """Images show what the values say: sizes, labels, one scale for a set, normals, transparency."""
 
 from dataclasses import replace
+from functools import partial
 from math import radians
 
 import numpy as np
@@ -10,16 +11,13 @@ from PIL import Image, ImageDraw
 
 from derender.render import render_scene
 from derender.report import colours, panel
-from derender.report.decomposition import (
-    COLUMN_MEANING,
-    decomposition,
-    from_another_view,
-    under_another_light,
-)
+from derender.report import decomposition as drawing
+from derender.report.decomposition import COLUMN_MEANING, decomposition
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 from derender.scene import Scene
 
 FOV_DEG = 10.0
+render = partial(render_scene, fov_deg=FOV_DEG)
 
 
 def bump(count: int = 3, size: int = 16) -> Scene:
@@ -33,24 +31,6 @@ def bump(count: int = 3, size: int = 16) -> Scene:
     return Scene(hill.repeat(count, 1, 1), torch.full((count, 3, size, size), 0.6), light, camera)
 
 
-def render(scene: Scene):
-    return render_scene(scene, FOV_DEG)
-
-
-@pytest.fixture
-def drawn_text(monkeypatch) -> list[str]:
-    """Every text that is drawn into an image."""
-    seen: list[str] = []
-    original = ImageDraw.ImageDraw.text
-
-    def text(self, xy, text, *rest, **named):
-        seen.append(text)
-        return original(self, xy, text, *rest, **named)
-
-    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
-    return seen
-
-
 def test_every_column_is_drawn_and_a_further_factor_where_its_parameter_is_a_map():
     extra = {"gloss": torch.rand(3, 16, 16), "tint": torch.rand(3, 3, 16, 16), "age": torch.rand(3, 2)}
     scene = replace(bump(), extra=extra)
@@ -59,16 +39,18 @@ def test_every_column_is_drawn_and_a_further_factor_where_its_parameter_is_a_map
     assert all([image.size for image in images] == [(16, 16)] * 3 for images in drawn.columns.values())
 
 
-def test_panel_has_the_expected_size_and_labels(drawn_text):
+def test_panel_has_the_expected_size_and_labels(monkeypatch):
+    written, pen, text = [], ImageDraw.ImageDraw, ImageDraw.ImageDraw.text
+    monkeypatch.setattr(pen, "text", lambda *all, **more: written.append(all[2]) or text(*all, **more))
     scene = bump()
     drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
     layout = GridLayout(cell=90, gap=10, margin=20, label=12)
     one = drawn.panel(1, layout)
-    assert drawn_text == list(COLUMN_MEANING)
+    assert written == list(COLUMN_MEANING)
     assert one.size == (20 + 8 * 90 + 7 * 10 + 20, 20 + 12 + 10 + 90 + 20)
     sheet = drawn.sheet(["a.jpg", "b.jpg", "c.jpg"], layout)
     assert sheet.height == one.height + 2 * (90 + 10) and sheet.width > one.width
-    assert {"a.jpg", "b.jpg", "c.jpg"} <= set(drawn_text)
+    assert {"a.jpg", "b.jpg", "c.jpg"} <= set(written)
 
 
 def test_contact_sheet_and_pairs():
@@ -128,7 +110,7 @@ def test_uncovered_pixels_are_transparent_and_white_on_paper():
 
 def test_another_light_comes_from_the_other_side_and_another_view_turns_back():
     scene = bump()
-    light, camera = under_another_light(scene).light, from_another_view(scene).camera
+    light, camera = drawing.under_another_light(scene).light, drawing.from_another_view(scene).camera
     assert (light[:, 3].sign() == torch.tensor([1.0, 1.0, -1.0])).all()
     torch.testing.assert_close(light[:, :2].sum(dim=1), scene.light[:, :2].sum(dim=1))  # as bright
     assert (camera[:, 1] - scene.camera[:, 1]).abs() == pytest.approx([radians(35)] * 3)

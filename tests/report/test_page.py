@@ -3,6 +3,7 @@
 import hashlib
 import re
 from base64 import b64encode
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -34,6 +35,7 @@ def picture(level: int = 90) -> Image.Image:
     return Image.fromarray(np.full((6, 4, 3), level, np.uint8))
 
 
+@cache
 def full_page(text: str = "plain") -> str:
     """One of every block, with ``text`` wherever a text goes."""
     columns, rows = [Column(text, "high", note=text)], [Row(text, [0.5], note=text), Row("c", [text], True)]
@@ -110,11 +112,8 @@ def test_charts_take_the_colour_of_the_page_and_are_the_same_every_time():
 
 def test_table_marks_the_best_and_gives_numbers_to_sort_by():
     columns = [Column("up", "high"), Column("down", "low", 1), Column("size")]
-    rows = [
-        Row("ours", [0.4, 3.0, 1200]),
-        Row("pixels", [0.5, 2.0, 7], True),
-        Row("none", [None, float("nan"), "-"], True),
-    ]
+    rows = [Row("ours", [0.4, 3.0, 1200]), Row("pixels", [0.5, 2.0, 7], True)]
+    rows += [Row("none", [None, float("nan"), "-"], True)]
     html = ONE_TABLE.render(table=ScoreTable("scores", "features", columns, rows))
     best = re.findall(r'<td data-value="([^"]+)" class="best"', html)
     assert best == ["0.5", "2"]

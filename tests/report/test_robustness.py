@@ -6,9 +6,7 @@ from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.robust import CurveResult, RobustnessComparison
 
 
-def made_up() -> RobustnessComparison:
-    """Features that fall from 0.9 to 0.5 beside a control that stays at 0.25."""
-
+def test_tables_say_what_was_learned_tested_and_lost():
     def row(name: str, control: bool, area: float, ends: tuple[float, float]) -> ScoredRow:
         named = {"ordinary": ends[0], "area": area, "0 deg": ends[0], "40 deg": ends[1]}
         drawn = np.linspace(-0.01, 0.01, 5)
@@ -17,22 +15,16 @@ def made_up() -> RobustnessComparison:
 
     rows = with_verdicts([row("albedo", False, 0.7, (0.9, 0.5)), row("majority", True, 0.25, (0.25, 0.25))])
     curve = CurveResult("yaw", "camera yaw", (0.0, 40.0), (8, 8, 16), {"accuracy": rows})
-    return RobustnessComparison(
-        (curve,), "identity of generated faces", "classes", ("a", "b"), "logistic", {"yaw": 19}, 3, (0, 1)
-    )
-
-
-def test_tables_say_what_was_learned_tested_and_lost():
-    found = made_up()
+    how = ("identity of generated faces", "classes", ("a", "b"), "logistic", {"yaw": 19}, 3, (0, 1))
+    found = RobustnessComparison((curve,), *how)
     area, curve, _ = found.tables()
     assert area.caption == (
         "camera yaw, 0 to 40 degrees: accuracy of 2 classes, identity of generated faces; logistic probes on "
         "19 images, 8 to 16 tested, 2 seeds; 3 images without label left out"
     )
     cells = area.values()["albedo"]
-    assert [round(float(cells[name]), 3) for name in ("area", "ordinary", "at 40 deg", "lost")] == [
-        *(0.7, 0.9, 0.5, 0.2)
-    ]
+    shown = [round(float(cells[name]), 3) for name in ("area", "ordinary", "at 40 deg", "lost")]
+    assert shown == [0.7, 0.9, 0.5, 0.2]
     assert area.best(0) == cells["area"] and area.best(5) is None  # to lose nothing is no merit by itself
     assert [row.control for row in area.rows] == [False, True]
     assert list(curve.values()["majority"]) == ["0", "40"]

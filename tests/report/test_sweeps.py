@@ -1,5 +1,6 @@
 """Sweeps of light and view: ends, signs, what stays; swaps."""
 
+from functools import partial
 from math import radians
 
 import numpy as np
@@ -12,6 +13,7 @@ from derender.report.colours import on_background
 from derender.scene import Scene
 
 FOV_DEG = 10.0
+render = partial(render_scene, fov_deg=FOV_DEG)
 
 
 def ball(size: int = 24) -> Scene:
@@ -19,10 +21,6 @@ def ball(size: int = 24) -> Scene:
     depth = 1.04 - 0.06 * torch.exp(-4 * (axis[:, None] ** 2 + axis[None] ** 2))
     light = torch.tensor([[0.2, 0.7, 0.1, 0.3]])
     return Scene(depth[None], torch.full((1, 3, size, size), 0.6), light, torch.zeros(1, 6))
-
-
-def render(scene: Scene):
-    return render_scene(scene, FOV_DEG)
 
 
 def test_places():

@@ -1,12 +1,12 @@
 """Names that are markup or formulas, in every kind of report: one script, the page's own, and no handler."""
 
 import json
-from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from tests.report.test_page import Elements
 
 from derender.data import ImageSet, Skipped
 from derender.data.doctor import doctor
@@ -31,18 +31,6 @@ EVIL = [
     '" onload="alert(3)',
     "$\\frac$ & ]]>",
 ]
-
-
-class Elements(HTMLParser):
-    """Every element with its attributes."""
-
-    def __init__(self, html: str):
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.found.append((tag, dict(attrs)))
 
 
 def harmless(page: Page, evil: str) -> None:

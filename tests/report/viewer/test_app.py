@@ -55,10 +55,8 @@ def test_a_picture_is_taken_apart_and_shown(client):
 def test_a_fitted_scene_is_nearer_to_the_picture():
     model, face = load("rendered-faces-64"), faces.generate(1, 64, seed=5).images[0]
     held_out = read_errors(model_folder("rendered-faces-64"))
-    read, fitted = (
-        Studio(model, "faces", held_out=held_out, fit_steps=steps).open(face.transpose(1, 2, 0))
-        for steps in (0, 10)
-    )
+    studios = (Studio(model, "faces", held_out=held_out, fit_steps=steps) for steps in (0, 10))
+    read, fitted = (studio.open(face.transpose(1, 2, 0)) for studio in studios)
     assert fitted["l1_feed_forward"] == pytest.approx(read["l1"])
     assert fitted["l1"] < 0.9 * read["l1"]
     assert fitted["percentile"] == read["percentile"] is not None  # of the feed-forward scene
@@ -74,10 +72,8 @@ def test_light_and_camera_move(client):
 
     dark, bright = shown({"diffuse": 0.0, "ambient": 0.1}), shown({"diffuse": 0.0, "ambient": 1.0})
     assert dark[..., :3].mean() < 0.3 * bright[..., :3].mean()
-    left, right = (
-        client.post("/api/view", {"picture": name, "light": {**LIGHT, "yaw_deg": yaw}}).image
-        for yaw in (60.0, -60.0)
-    )
+    lit = ({"picture": name, "light": {**LIGHT, "yaw_deg": yaw}} for yaw in (60.0, -60.0))
+    left, right = (client.post("/api/view", asked).image for asked in lit)
     assert not np.array_equal(left, right)
     moved = shown({}, {"rotation_deg": [0, 0, 0], "translation": [0.05, 0, 0]})
     assert (moved[:, :8, 3] == 0).all() and (shown({})[..., 3] == 255).all()
@@ -162,11 +158,8 @@ def test_pictures_that_are_not_there(client):
     assert (reply.status, "open it again" in reply.error) == (410, True)
     assert client.post("/api/examples/7").status == 404
     assert client.post("/api/rows/0").status == 404
-    assert (
-        client.post("/api/neighbours", {"picture": client.opened()["picture"], "factor": "albedo"}).status
-        == 404
-    )
     first = client.opened(0)["picture"]
+    assert client.post("/api/neighbours", {"picture": first, "factor": "albedo"}).status == 404
     for seed in range(4):
         client.opened(seed)
     assert client.post("/api/view", {"picture": first}).status == 410

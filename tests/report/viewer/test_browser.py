@@ -52,12 +52,17 @@ def browser():
         running.close()
 
 
+def begun(browser, **context: object):
+    """An empty page, patient with slow machines."""
+    shown = browser.new_context(**context).new_page()
+    shown.set_default_timeout(PATIENCE_MS)
+    return shown
+
+
 @pytest.fixture
 def page(browser, address):
     """The page, opened; at the end it must have asked nobody else and complained of nothing."""
-    context = browser.new_context(viewport={"width": 1200, "height": 900})
-    shown = context.new_page()
-    shown.set_default_timeout(PATIENCE_MS)
+    shown = begun(browser, viewport={"width": 1200, "height": 900})
     asked, wrong = [], []
     shown.on("request", lambda request: asked.append(request.url))
     shown.on("pageerror", lambda error: wrong.append(str(error)))
@@ -66,16 +71,15 @@ def page(browser, address):
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
     yield shown
-    context.close()
+    shown.context.close()
     assert not wrong
     assert all(url.startswith((address, "data:", f"blob:{address}")) for url in asked)
 
 
 def pixels(page, selector: str) -> np.ndarray:
     """What an element shows now."""
-    return np.asarray(Image.open(io.BytesIO(page.locator(selector).screenshot())).convert("RGB")).astype(
-        float
-    )
+    shown = Image.open(io.BytesIO(page.locator(selector).screenshot()))
+    return np.asarray(shown.convert("RGB")).astype(float)
 
 
 def set_slider(page, name: str, value: float) -> None:
@@ -195,8 +199,7 @@ def test_effects_of_a_renderer_have_sliders(browser, rendered):
     model.load_state_dict(model.state_dict() | plain.state_dict())
     examples = [Example("face", rendered[0].transpose(1, 2, 0))]
     with serving(Application(Viewer(Studio(model.eval(), "glossy", Shelf(3)), examples))) as url:
-        shown = browser.new_context().new_page()
-        shown.set_default_timeout(PATIENCE_MS)
+        shown = begun(browser)
         shown.goto(url)
         shown.wait_for_selector("body[data-ready]")
         at_rest(shown)
@@ -249,16 +252,13 @@ def test_orbit_swap_and_neighbours_by_keyboard(page):
 
 
 def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
-    page.set_input_files(
-        "#file", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"<svg onload=alert(1)>"}
-    )
+    wrong = {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"<svg onload=alert(1)>"}
+    page.set_input_files("#file", wrong)
     page.wait_for_selector("#status.wrong")
     assert "not an image" in page.inner_text("#status")
     for number in (1, 2, 0):  # the shelf holds three: the first goes
-        page.set_input_files(
-            "#file-second",
-            {"name": f"{number}.png", "mimeType": "image/png", "buffer": png(rendered[number])},
-        )
+        file = {"name": f"{number}.png", "mimeType": "image/png", "buffer": png(rendered[number])}
+        page.set_input_files("#file-second", file)
         page.wait_for_selector(f'#second[alt="second photograph: {number}.png"]')
     set_slider(page, "camera-yaw", 30)  # opens it again
     assert "no longer stored" not in page.inner_text("#status")
@@ -267,9 +267,7 @@ def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (820, 1180), (1280, 900)])
 def test_it_fits_every_width_and_follows_the_dark(browser, address, width, height):
     size = {"width": width, "height": height}
-    context = browser.new_context(viewport=size, color_scheme="dark", has_touch=width < 1000)
-    shown = context.new_page()
-    shown.set_default_timeout(PATIENCE_MS)
+    shown = begun(browser, viewport=size, color_scheme="dark", has_touch=width < 1000)
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
     wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
@@ -278,18 +276,16 @@ def test_it_fits_every_width_and_follows_the_dark(browser, address, width, heigh
         box = shown.locator(name).bounding_box()
         assert box["y"] > 0 and box["y"] + box["height"] <= height and box["width"] > 100
     assert shown.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 22, 26)"
-    context.close()
+    shown.context.close()
 
 
 def test_without_webgl_the_server_draws_the_orbit(browser, address):
-    context = browser.new_context(viewport={"width": 900, "height": 900})
-    context.add_init_script(
+    shown = begun(browser, viewport={"width": 900, "height": 900})
+    shown.add_init_script(
         "const get = HTMLCanvasElement.prototype.getContext;"
         "HTMLCanvasElement.prototype.getContext = function (kind, ...more) "
         "{ return kind === 'webgl2' ? null : get.call(this, kind, ...more); };"
     )
-    shown = context.new_page()
-    shown.set_default_timeout(PATIENCE_MS)
     shown.goto(address)
     shown.wait_for_selector('#surface[data-drawn="server"][width="256"]')
     shown.wait_for_timeout(500)
@@ -299,4 +295,4 @@ def test_without_webgl_the_server_draws_the_orbit(browser, address):
         shown.keyboard.press("ArrowRight")
     shown.wait_for_timeout(1500)
     assert front.std() > 10 and np.abs(pixels(shown, "#surface") - front).mean() > 3
-    context.close()
+    shown.context.close()

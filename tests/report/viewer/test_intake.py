@@ -1,28 +1,15 @@
 """What is no image, lies, or would fill the memory is refused with a sentence; what is one is read."""
 
 import io
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from tests.trust.hostile_files import png_that_says
 
 from derender.report.viewer.app import BODY_LIMIT_BYTES
 from derender.report.viewer.questions import PIXEL_LIMIT, Refused, pixels_of
-
-
-def png_that_claims(width: int, height: int) -> bytes:
-    """A PNG of that size whose pixels are missing but for a few."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-        )
-
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(10_000))) + chunk(b"IEND", b"")
 
 
 def saved(form: str, mode: str = "RGB", size: tuple[int, int] = (20, 14)) -> bytes:
@@ -47,8 +34,8 @@ def test_pictures_are_read_whatever_they_are_called(client, form):
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", 415, "not an image"),
         (b"PK\x03\x04" + bytes(99), 415, "not an image"),
         (saved("PNG")[:60], 415, "damaged"),
-        (png_that_claims(60_000, 60_000), 413, "million pixels"),
-        (png_that_claims(8160, 6144), 413, "make it smaller"),  # 50 million pixels
+        (png_that_says(60_000, 60_000), 413, "million pixels"),
+        (png_that_says(8160, 6144), 413, "make it smaller"),  # 50 million pixels
     ],
     ids=["empty", "html", "svg", "postscript", "zip", "cut off", "bomb", "50 megapixels"],
 )
@@ -61,7 +48,7 @@ def test_what_is_refused(client, content, status, words):
 
 def test_bounds_on_pixels_and_bytes(client):
     with pytest.raises(Refused, match="40 million"):
-        pixels_of(png_that_claims(PIXEL_LIMIT // 1000 + 1, 1000), 8)
+        pixels_of(png_that_says(PIXEL_LIMIT // 1000 + 1, 1000), 8)
     reply = client.post("/api/pictures", bytes(BODY_LIMIT_BYTES + 1))
     assert (reply.status, "20 MB" in reply.error) == (413, True)
 
