@@ -19,10 +19,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def shared_folder() -> Path | None:
     """Where the development data lies: $DERENDER_SHARED, or ``shared`` beside the checkout, or None."""
-    candidates = (
-        [Path(os.environ["DERENDER_SHARED"])] if "DERENDER_SHARED" in os.environ else [ROOT.parent / "shared"]
-    )
-    return next((path for path in candidates if path.is_dir()), None)
+    folder = Path(os.environ.get("DERENDER_SHARED", ROOT.parent / "shared"))
+    return folder if folder.is_dir() else None
 
 
 @pytest.fixture
@@ -32,9 +30,7 @@ def shared_data():
     def find(name: str) -> Path:
         folder = shared_folder()
         if folder is None or not (folder / name).exists():
-            pytest.skip(
-                f"development data {name} is not here (set DERENDER_SHARED to the folder that holds it)"
-            )
+            pytest.skip(f"development data {name} is not here (set DERENDER_SHARED to the folder of it)")
         return folder / name
 
     return find
@@ -43,3 +39,10 @@ def shared_data():
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _restore_determinism():
+    """A run with ``deterministic=true`` leaves torch as it was."""
+    yield
+    torch.use_deterministic_algorithms(False)

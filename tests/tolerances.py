@@ -11,10 +11,9 @@ ABSOLUTE = {torch.float32: 1e-6, torch.float64: 1e-12}
 
 def assert_agrees(actual: Tensor, expected: Tensor, what: str = "value") -> None:
     """Same shape and dtype, finite, and no farther apart than the table allows."""
-    assert actual.shape == expected.shape, (
-        f"{what}: shape {tuple(actual.shape)}, expected {tuple(expected.shape)}"
-    )
-    assert actual.dtype == expected.dtype, f"{what}: {actual.dtype}, expected {expected.dtype}"
+    for name in ("shape", "dtype"):
+        one, other = getattr(actual, name), getattr(expected, name)
+        assert one == other, f"{what}: {name} {one}, expected {other}"
     assert actual.isfinite().all(), f"{what}: not finite"
     if expected.numel() == 0:
         return

@@ -23,12 +23,6 @@ def blobs() -> ImageSet:
     return ImageSet(images, tuple(f"{i:02d}.png" for i in range(48)), labels, source="made by the test")
 
 
-@pytest.fixture(autouse=True)
-def _restore_determinism():
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 @pytest.fixture(scope="session")
 def losses():
     """The losses of a batch, whose random numbers come from a seed or a generator."""

@@ -37,14 +37,7 @@ def tree(tmp_path: Path, encoded) -> Callable[..., Path]:
         files: list[str] | dict[str, bytes | str | None], zipped: bool = False, name: str = "set"
     ) -> Path:
         contents = dict.fromkeys(files) if isinstance(files, list) else files
-        data = {
-            file: content.encode()
-            if isinstance(content, str)
-            else encoded(seed)
-            if content is None
-            else content
-            for seed, (file, content) in enumerate(contents.items())
-        }
+        data = {file: encoded(at) if one is None else one for at, (file, one) in enumerate(contents.items())}
         if zipped:
             path = tmp_path / f"{name}.zip"
             with zipfile.ZipFile(path, "w") as archive:
@@ -54,7 +47,12 @@ def tree(tmp_path: Path, encoded) -> Callable[..., Path]:
         for file, content in data.items():
             path = tmp_path / name / file
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
         return tmp_path / name
 
     return make
+
+
+@pytest.fixture
+def numbers() -> np.random.Generator:
+    return np.random.default_rng(3)

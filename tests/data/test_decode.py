@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from tests.data.conftest import noise
+from tests.trust.hostile_files import png_chunk as chunk
 
 from derender.data import image as module
 from derender.data import read_image
@@ -60,9 +61,6 @@ def test_sixteen_bits_are_scaled_not_clipped(encoded, form):
 
 
 def png(width: int, height: int, bits: int, colour_type: int, rows: bytes) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     header = struct.pack(">IIBBBBB", width, height, bits, colour_type, 0, 0, 0)
     chunks = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + chunks

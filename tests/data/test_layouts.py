@@ -51,9 +51,7 @@ SYNCAR = {
     "train/params.csv": "file,class,model,elev\nimages/000000.jpg,taxi,a/b,90\n",
     "test/params.csv": "file,class,model,elev\nimages/000000.jpg,police,a/c,45\n",
 }
-TRACKS = images(
-    "tracks/id1/track_000/000.jpg", "tracks/id1/track_001/000.jpg", "tracks/id2/track_000/000.jpg"
-)
+TRACKS = images(*(f"tracks/id{at}/000.jpg" for at in ("1/track_000", "1/track_001", "2/track_000")))
 RAF = {
     "basic/EmoLabel/list_patition_label.txt": "".join(f"train_{row:05d}.jpg {row}\n" for row in range(1, 8))
     + "test_0001.jpg 4\n",
@@ -78,7 +76,7 @@ EPISODES = {
     "ids/buffy.ids": BUFFY,
     "ids/bbt.ids": "CVHCI_TRACKLABELS_V1\n1 penny\n2 sheldon\n",
     **images(
-        "bbt/00001/a b.jpg", "buffy/1/0001.jpg", "buffy/13/0002.jpg", "buffy/99/0001.jpg", "notes/x.jpg"
+        "bbt/00001/a b.jpg", "notes/x.jpg", *(f"buffy/{at}.jpg" for at in ("1/0001", "13/0002", "99/0001"))
     ),
 }
 NESTED = images("Ann/0/0.555.jpg", "Ann/1/0.1.jpg", "Bo/0/0.3.jpg", "Bo/track_002/frame_01.jpg")
@@ -372,10 +370,8 @@ def test_celeba_in_the_wild_is_cropped_by_landmarks(tree, encoded, tmp_path):
     np.testing.assert_allclose(boxes[:2], sides)
     assert np.isnan(boxes[2]).all()
     assert found_in(source, subset="val").table.boxes.tolist() == [sides[1]]
-    expected = [
-        decode(content, 10, "crop", np.array(box, np.float32))
-        for content, box in zip(list(contents.values())[:2], sides, strict=True)
-    ]
+    pairs = zip(list(contents.values())[:2], sides, strict=True)
+    expected = [decode(content, 10, "crop", np.array(box, np.float32)) for content, box in pairs]
     for options in ({}, {"cache": tmp_path / "cache"}, {"cache": tmp_path / "cache"}):
         pictures = read_images(source, 10, **options)
         assert [row.file for row in pictures.skipped] == ["img_celeba/000003.jpg"]

@@ -12,14 +12,10 @@ from derender.data import MASK_CLASSES, list_images, read_ground_truth, read_ima
 from derender.data.maps import DEPTH_RANGE
 
 HEADER = "file,identity,expression,ambient,diffuse,light_pitch,light_yaw,pitch,yaw,roll,tx,ty\n"
-ROWS = (
-    "images/000000.jpg,1,happy,0.3,0.6,30,-45,10,20,-5,0.001,-0.002\n"
-    "images/000001.jpg,2,sad,.5,.4,0,0,0,0,0,0,0\n"
-)
-MAPPING = (
-    "idx orig_idx         orig_file\n"
-    "0       119613       119614.jpg\n1       162769       162770.jpg\n2       182637       182638.jpg\n"
-)
+ROWS = "images/000000.jpg,1,happy,0.3,0.6,30,-45,10,20,-5,0.001,-0.002\n"
+ROWS += "images/000001.jpg,2,sad,.5,.4,0,0,0,0,0,0,0\n"
+MAPPING = "idx orig_idx         orig_file\n0       119613       119614.jpg\n"
+MAPPING += "1       162769       162770.jpg\n2       182637       182638.jpg\n"
 SIZE = 12
 ZERO = np.zeros((32, 32), np.uint8)
 

@@ -18,9 +18,8 @@ ROWS, CLAIMED = 3, 2**26
 @pytest.fixture
 def table(tmp_path) -> Path:
     factors = {"geometry": np.random.default_rng(0).normal(size=(ROWS, 4))}
-    return FeatureTable(("a", "b", "c"), factors, {"age": np.array([1.0, 2, 3])}).write(
-        tmp_path / "F.parquet"
-    )
+    made = FeatureTable(("a", "b", "c"), factors, {"age": np.array([1.0, 2, 3])})
+    return made.write(tmp_path / "F.parquet")
 
 
 def number(value: int) -> bytes:

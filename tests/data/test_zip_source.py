@@ -68,14 +68,13 @@ def test_one_name_twice_and_separators_of_other_systems(contents):
     assert contents(twice) == {"a.txt": b"later", "b/c.txt": b"between"}
 
 
+AS_TEXT = set_in_directory(PLAIN, NAME, 8, struct.pack("<H", 0x800))
 DAMAGED = {
     "cut": PLAIN[:-1],
     "too long a directory": PLAIN[:-10] + b"\xff\xff\xff\x7f" + PLAIN[-6:],
     "no entry": set_in_directory(PLAIN, NAME, 2, b"\0\0"),
     "a later version": set_in_directory(PLAIN, NAME, 6, b"\x63"),
-    "a name that is no text": set_in_directory(
-        set_in_directory(PLAIN, NAME, 8, struct.pack("<H", 0x800)), NAME, 46, b"\xff"
-    ),
+    "a name that is no text": set_in_directory(AS_TEXT, NAME, 46, b"\xff"),
 }
 
 

@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, one_hot
 
 import derender
 from derender.data import ImageSet
-from derender.evaluation.finetuning import (
-    RENDERING_TERMS,
-    FinetuneStep,
-    FinetuneTask,
-    load_finetuned,
-    score_finetuned,
-    target_of,
-)
+from derender.evaluation import finetuning
+from derender.evaluation.finetuning import FinetuneStep, FinetuneTask, load_finetuned, target_of
 from derender.evaluation.linear_probes import head_loss
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
@@ -33,12 +27,6 @@ TINY += ["validate_every=32", "checkpoint_every=32", "deterministic=true", "watc
 TINY += ["final_rate=1"]  # resuming with more images goes on at the same rate
 
 
-@pytest.fixture(autouse=True)
-def _restore_determinism():
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 @pytest.fixture(scope="module")
 def pictures() -> ImageSet:
     """Bright and dark images of which some carry no label; three shades; a value that never changes."""
@@ -47,12 +35,8 @@ def pictures() -> ImageSet:
     images = random.integers(0, 60, (60, 3, 32, 32)) + 80 * shade[:, None, None, None]
     bright = np.where(shade == 2, 1, 0).astype(np.int8)
     bright[::10] = -1
-    labels = {
-        "bright": bright,
-        "dark": (shade == 0).astype(np.int8),
-        "shade": np.array(["low", "middle", "high"])[shade],
-        "same": np.zeros(60, np.int8),
-    }
+    labels = {"bright": bright, "dark": (shade == 0).astype(np.int8), "same": np.zeros(60, np.int8)}
+    labels["shade"] = np.array(["low", "middle", "high"])[shade]
     files = tuple(f"{row:02d}.png" for row in range(60))
     return ImageSet(images.astype(np.uint8), files, labels, source="made by the test")
 
@@ -77,16 +61,14 @@ def test_both_objectives_reach_the_encoders(pictures, tmp_path):
     def gradient(weight: float, rendering: float) -> tuple[float, torch.Tensor]:
         one = task(pictures, target__weight=weight, target__rendering_weight=rendering)
         model = one.build()
-        module = one.step_module(
-            model, RunFolder(tmp_path), torch.zeros(0, 3, 32, 32, dtype=torch.uint8), lambda *at: None
-        )
+        nothing = torch.zeros(0, 3, 32, 32, dtype=torch.uint8)
+        module = one.step_module(model, RunFolder(tmp_path), nothing, lambda *at: None)
         rows = one.target.split.train[:8]
         images = torch.from_numpy(pictures.images[rows]).float() / 255
         precision = network_precision("32-true", torch.device("cpu"))
-        losses = compute_step(
-            module, images, random_stream(0, "perturb", 0), precision, 0.5, torch.from_numpy(rows)
-        )
-        assert set(losses.terms) - {"target"} <= set(RENDERING_TERMS)
+        stream = random_stream(0, "perturb", 0)
+        losses = compute_step(module, images, stream, precision, 0.5, torch.from_numpy(rows))
+        assert set(losses.terms) - {"target"} <= set(finetuning.RENDERING_TERMS)
         losses.total.backward()
         found = [model.model.nets[one].encoder.convolutions[0].weight.grad for one in ("geometry", "albedo")]
         return losses.total.item(), torch.stack(found)
@@ -131,36 +113,31 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
     before = {name: value.clone() for name, value in start.state_dict().items()}
     fast = ["images=240", "learning_rate=5e-3", "rendering_weight=0", "split=[0.4, 0.2, 0.4]"]
     one = task(pictures, *fast, start=start, labels=("bright", "dark"))
-    assert torch.equal(
-        one.build().model.nets["albedo"].decoder.last.weight, before["nets.albedo.decoder.last.weight"]
-    )
+    last = one.build().model.nets["albedo"].decoder.last.weight
+    assert torch.equal(last, before["nets.albedo.decoder.last.weight"])
     train_task(one, pictures, tmp_path / "run")
     tuned, first, second = load_finetuned(tmp_path / "run"), Memory(tmp_path / "m"), Memory(tmp_path / "m")
-    found = score_finetuned(tuned, one, resample_count=50, memory=first)
-    again = score_finetuned(tuned, one, resample_count=50, memory=second)
+    found = finetuning.score_finetuned(tuned, one, resample_count=50, memory=first)
+    again = finetuning.score_finetuned(tuned, one, resample_count=50, memory=second)
     assert str(again.numbers()) == str(found.numbers()) and found.n_unlabelled == 0
     assert (second.made, second.recalled) == (0, first.made) and first.made == 9
     targets = one.target.asked.targets.copy()
     targets[one.target.split.train[:3]] = -1
     fewer = replace(one, target=replace(one.target, asked=replace(one.target.asked, targets=targets)))
-    some = score_finetuned(tuned, fewer, resample_count=50, memory=second)
+    some = finetuning.score_finetuned(tuned, fewer, resample_count=50, memory=second)
     assert some.n_unlabelled == 3 and "3 images without label" in some.table("fresh").caption
     rows = {row.name: row.scores["balanced_accuracy"].value for row in found.rows}
     assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
-    assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24) and found.versus[
-        "accuracy"
-    ].rival != "fine-tuned"
+    assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24)
+    assert found.versus["accuracy"].rival != "fine-tuned"
     table = found.table("fresh weights").values()
     controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]
     assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", *controls]
     assert rows["pixels, logistic"] > 0.9  # brightness is in the pixels themselves
     assert all(torch.equal(value, before[name]) for name, value in start.state_dict().items())
     assert not any(parameter.requires_grad for parameter in start.parameters())
-    changed = derender.load(tmp_path / "run").state_dict()
-    assert not torch.equal(
-        changed["nets.geometry.encoder.convolutions.0.weight"],
-        before["nets.geometry.encoder.convolutions.0.weight"],
-    )
+    name = "nets.geometry.encoder.convolutions.0.weight"
+    assert not torch.equal(derender.load(tmp_path / "run").state_dict()[name], before[name])
 
 
 def test_labels_beyond_those_asked_for_and_those_tested_stay_hidden(pictures):
@@ -178,15 +155,12 @@ def test_the_loss_of_a_head_is_torchs_cross_entropy_over_what_is_known():
 
     torch.manual_seed(0)
     logits, classes = torch.randn(6, 3), torch.tensor([0, 1, 2, 2, 1, 0])
-    targets = torch.nn.functional.one_hot(classes, 3).float()
+    targets = one_hot(classes, 3).float()
     targets[4:] = -1
-    assert target_loss(logits, targets, "classes") == pytest.approx(
-        cross_entropy(logits[:4], classes[:4]).item()
-    )
+    expected = cross_entropy(logits[:4], classes[:4])
+    assert target_loss(logits, targets, "classes") == pytest.approx(expected.item())
     yes_no = torch.tensor([[1.0, -1], [0, 1], [-1, -1]])
-    expected = torch.nn.functional.binary_cross_entropy_with_logits(
-        logits[[0, 1, 1], [0, 0, 1]], torch.tensor([1.0, 0, 1])
-    )
+    expected = binary_cross_entropy_with_logits(logits[[0, 1, 1], [0, 0, 1]], torch.tensor([1.0, 0, 1]))
     assert target_loss(logits[:3, :2], yes_no, "labels") == pytest.approx(expected.item())
     for kind in ("classes", "labels"):
         assert target_loss(logits, torch.full((6, 3), -1.0), kind) == 0
@@ -222,7 +196,7 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
         load_finetuned(saved)
     nothing = replace(one.target.asked, targets=np.full_like(one.target.asked.targets, -1))
     with pytest.raises(ValueError, match="test part has 0 images with a label"):
-        score_finetuned(one.build(), replace(one, target=replace(one.target, asked=nothing)))
+        finetuning.score_finetuned(one.build(), replace(one, target=replace(one.target, asked=nothing)))
 
 
 def test_every_batch_of_the_loop_gets_its_labels(pictures, tmp_path, monkeypatch):

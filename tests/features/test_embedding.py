@@ -114,9 +114,8 @@ def stop_after(rows: int, how=KeyboardInterrupt):
 def test_the_table_is_that_of_the_set_in_memory(model, source, tmp_path, out, keep):
     expected, seen = in_memory(model, source, tmp_path / "m.parquet", keep_duplicates=keep), []
     model.train()
-    done = streamed(
-        model, source, out, keep_duplicates=keep, workers=2, progress=lambda *state: seen.append(state)
-    )
+    how = {"keep_duplicates": keep, "progress": lambda *state: seen.append(state)}
+    done = streamed(model, source, out, workers=2, **how)
     assert model.training
     assert seen[-1] == (COUNT, COUNT) and all(done <= total for done, total in seen)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)

@@ -8,14 +8,10 @@ from derender.features import FeatureTable, embed_image_set, model_fingerprint
 
 def test_features_are_those_of_the_model_whatever_the_batch(model, pictures):
     expected = model.eval().embed(torch.from_numpy(pictures.images).float() / 255)
-    for batch_size in (1, 4, 11, 100):
+    for size in (1, 4, 11, 100):
         seen: list[tuple[int, int]] = []
-
-        def progress(*state: int, seen=seen) -> None:
-            seen.append(state)
-
-        table = embed_image_set(model, pictures, batch_size=batch_size, progress=progress)
-        assert seen == [(min(end, 11), 11) for end in range(batch_size, 11 + batch_size, batch_size)]
+        table = embed_image_set(model, pictures, batch_size=size, progress=lambda *at, to=seen: to.append(at))
+        assert seen == [(min(end, 11), 11) for end in range(size, 11 + size, size)]
         for name in expected:
             np.testing.assert_allclose(table.factors[name], expected[name].detach(), rtol=1e-5, atol=1e-5)
 

@@ -81,10 +81,8 @@ def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
 
 
 def test_files_made_elsewhere_list_columns_are_factors(tmp_path):
-    table = pa.table(
-        {"code": [[1.0, 2.0], [3.0, 4.0]], "file": ["a", "b"], "who": ["x", None], "wide": [[1], [2]]}
-    )
-    pq.write_table(table, tmp_path / "t.parquet")
+    columns = {"code": [[1.0, 2.0], [3.0, 4.0]], "file": ["a", "b"], "who": ["x", None], "wide": [[1], [2]]}
+    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
     back = FeatureTable.read(tmp_path / "t.parquet")
     assert list(back.factors) == ["code", "wide"] and list(back.labels) == ["who"]
     np.testing.assert_array_equal(back.concatenate(), [[1, 2, 1], [3, 4, 2]])
@@ -99,10 +97,7 @@ def test_files_made_elsewhere_list_columns_are_factors(tmp_path):
         ({"file": ["a", "b"], "f": [[1.0], [1.0, 2.0]]}, "rows of different lengths \\(1 to 2\\)"),
         ({"file": ["a", "b"], "f": [[1.0], None]}, "empty in 1 rows"),
         ({"file": ["a"], "f": [["x"]]}, "holds string, expected numbers"),
-        (
-            {"file": ["a", "b"], "f": [[1.0], [np.nan]]},
-            "t.parquet: factor 'f' is not finite in 1 of 2 rows, f",
-        ),
+        ({"file": ["a", "b"], "f": [[1.0], [np.nan]]}, "t.parquet: factor 'f' is not finite in 1 of 2 rows"),
         ({"file": ["a", "b"], "f": [[1.0, None], [1.0, 2.0]]}, "not finite in 1 of 2 rows"),
     ],
 )
@@ -137,10 +132,8 @@ def test_absent_and_damaged_files_are_refused_in_words(tmp_path):
     ],
 )
 def test_damaged_metadata_is_refused_in_words(tmp_path, metadata, message):
-    table = pa.table({"file": ["a"], "f": [[1.0]], "who": ["x"]}).replace_schema_metadata(
-        {b"derender": metadata}
-    )
-    pq.write_table(table, tmp_path / "t.parquet")
+    table = pa.table({"file": ["a"], "f": [[1.0]], "who": ["x"]})
+    pq.write_table(table.replace_schema_metadata({b"derender": metadata}), tmp_path / "t.parquet")
     with pytest.raises(ValueError, match=message):
         FeatureTable.read(tmp_path / "t.parquet")
 
@@ -172,9 +165,7 @@ def test_concatenate_follows_the_order_asked_for_and_names_the_nearest():
     assert both.dtype == np.float32
     np.testing.assert_array_equal(table.concatenate("albedo"), table.factors["albedo"])
     np.testing.assert_array_equal(table.concatenate(), table.concatenate(("geometry", "albedo")))
-    with pytest.raises(
-        ValueError, match=r"unknown factor 'albdo'; did you mean 'albedo'\?; there is geometry"
-    ):
+    with pytest.raises(ValueError, match=r"factor 'albdo'; did you mean 'albedo'\?; there is geometry"):
         table.concatenate(("albdo",))
     with pytest.raises(ValueError, match="name at least one factor"):
         table.concatenate(())
@@ -193,19 +184,14 @@ def test_select_takes_slices_indices_and_masks():
 
 
 def test_mean_by_averages_groups_and_keeps_what_is_constant():
-    table = make(
-        6,
-        identity=np.array(["a", "a", "b", "a", "b", ""]),
-        track=np.array([0, 0, 0, 1, 0, 0]),
-        frame=np.arange(6),
-        weight=np.array([np.nan, np.nan, 2, 3, 2, 1]),
-    )
+    who, track = np.array(["a", "a", "b", "a", "b", ""]), np.array([0, 0, 0, 1, 0, 0])
+    weight = np.array([np.nan, np.nan, 2, 3, 2, 1])
+    table = make(6, identity=who, track=track, frame=np.arange(6), weight=weight)
     means = table.mean_by("identity", "track")
     assert means.files == ("a/0", "b/0", "a/1")
     g = table.factors["geometry"]
-    np.testing.assert_allclose(
-        means.factors["geometry"], [g[[0, 1]].mean(0), g[[2, 4]].mean(0), g[3]], rtol=1e-6
-    )
+    expected = [g[[0, 1]].mean(0), g[[2, 4]].mean(0), g[3]]
+    np.testing.assert_allclose(means.factors["geometry"], expected, rtol=1e-6)
     assert means.label("identity").tolist() == ["a", "b", "a"] and means.label("track").tolist() == [0, 0, 1]
     assert "frame" not in means.labels
     np.testing.assert_array_equal(means.label("weight"), [np.nan, 2, 3])

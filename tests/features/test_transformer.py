@@ -44,17 +44,9 @@ def test_every_form_of_picture_gives_the_same_features(model, pictures, tmp_path
         Image.fromarray(image.transpose(1, 2, 0)).save(path)
     transformer = DisentangledFeatures(model)
     expected = transformer.transform(images)
-    forms = [
-        images.transpose(0, 2, 3, 1),
-        images / 255,
-        (images / 255).astype(np.float32).transpose(0, 2, 3, 1),
-        torch.from_numpy(images) / 255,
-        list(images),
-        paths,
-        [str(path) for path in paths],
-        np.array([str(path) for path in paths])[:, None],
-    ]
-    for form in forms:
+    last, names = images.transpose(0, 2, 3, 1), [str(path) for path in paths]
+    forms = [last, images / 255, (last / 255).astype(np.float32), torch.from_numpy(images) / 255]
+    for form in (*forms, list(images), paths, names, np.array(names)[:, None]):
         np.testing.assert_allclose(transformer.transform(form), expected, rtol=1e-4, atol=1e-4)
 
 

@@ -5,17 +5,8 @@ import pytest
 import torch
 from torch import nn
 
-from derender.interpretation.attribution import (
-    METHODS,
-    factor_weights,
-    pixel_attribution,
-    saliency,
-    sanity_check,
-    score,
-    similarity,
-    spearman,
-    upsampled,
-)
+from derender.interpretation import attribution
+from derender.interpretation.attribution import METHODS, factor_weights, saliency, sanity_check, score
 from derender.interpretation.probe import Probe
 from derender.model import Derenderer
 from derender.networks.encoders import activations
@@ -91,7 +82,7 @@ def test_grad_cam_misleads_where_hires_cam_does_not(images):
 def test_pixels_sum_to_the_change_of_the_answer(images):
     """This network is linear where its ReLU is open, so the error is rounding."""
     weight = factor_weights(YES, "geometry", [0, 0, 0])
-    maps, error = pixel_attribution(Looking("input"), images * 0.4 + 0.55, "geometry", weight)
+    maps, error = attribution.pixel_attribution(Looking("input"), images * 0.4 + 0.55, "geometry", weight)
     assert error.max() < 1e-4
     encode = Looking("input").nets["geometry"].encode
     grey = torch.full_like(images, 0.5)
@@ -132,15 +123,12 @@ def test_hires_cam_before_its_rectifier_sums_to_the_answer(model, probe, images)
 def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, probe, images):
     width, names = model.activations(images[:1])["geometry"].shape[1], ("geometry", "albedo")
     draw = torch.Generator().manual_seed(0)
-    maps = {
-        name: Projection(torch.zeros(width), torch.randn(width, CODE, generator=draw), torch.ones(CODE))
-        for name in names
-    }
+    drawn = {name: torch.randn(width, CODE, generator=draw) for name in names}
+    maps = {name: Projection(torch.zeros(width), one, torch.ones(CODE)) for name, one in drawn.items()}
     mirroring = model.with_features(Features(Whitening(maps, mirrored=maps)))
     for method in METHODS:
-        own, mirror = (
-            saliency(method, mirroring, one, "albedo", probe, [0, 1, 0]) for one in (images, images.flip(-1))
-        )
+        sides = (images, images.flip(-1))
+        own, mirror = (saliency(method, mirroring, one, "albedo", probe, [0, 1, 0]) for one in sides)
         torch.testing.assert_close(own, mirror.flip(-1), rtol=1e-3, atol=1e-5)
         assert not torch.allclose(own, own.flip(-1), rtol=1e-2)
 
@@ -161,24 +149,24 @@ def test_new_weights_change_the_map_and_the_same_weights_do_not(model, probe, im
 
 
 def test_a_map_that_ignores_the_weights_is_not_trusted():
-    edges = torch.rand(3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
-    row = similarity("edges", "geometry", "random weights", edges, [edges * 2, edges.square()], SIZE)
+    edges, other = torch.rand(2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+    flat, told = torch.zeros_like(edges), ("geometry", "random weights", edges)
+    row = attribution.similarity("edges", *told, [edges * 2, edges.square()], SIZE)
     assert row.spearman == pytest.approx(1) and row.trusted is False
-    other = torch.rand(3, SIZE, SIZE, generator=torch.Generator().manual_seed(2))
-    assert similarity("noise", "geometry", "random weights", edges, [other], SIZE).trusted is True
-    flat = similarity("flat", "geometry", "random weights", edges, [torch.zeros_like(edges)], SIZE)
-    assert flat.empty == 1 and flat.trusted is None
+    assert attribution.similarity("noise", *told, [other], SIZE).trusted is True
+    row = attribution.similarity("flat", *told, [flat], SIZE)
+    assert row.empty == 1 and row.trusted is None
 
 
 def test_known_maps(model, images):
     """Rank correlation, upsampling, and the feature itself where there is no probe."""
     up = torch.arange(9.0).reshape(1, 3, 3)
-    assert [spearman(up, other)[0] for other in (up.exp(), -up)] == pytest.approx([1, -1])
-    assert np.isnan(spearman(up, torch.ones(1, 3, 3))[0])
-    torch.testing.assert_close(upsampled(torch.ones(1, 4, 4), 9), torch.ones(1, 9, 9))
+    assert [attribution.spearman(up, other)[0] for other in (up.exp(), -up)] == pytest.approx([1, -1])
+    assert np.isnan(attribution.spearman(up, torch.ones(1, 3, 3))[0])
+    torch.testing.assert_close(attribution.upsampled(torch.ones(1, 4, 4), 9), torch.ones(1, 9, 9))
     corner = torch.zeros(1, 4, 4)
     corner[0, 0, 3] = 1
-    assert divmod(int(upsampled(corner, 32)[0].argmax()), 32) == (0, 28)
+    assert divmod(int(attribution.upsampled(corner, 32)[0].argmax()), 32) == (0, 28)
     maps = saliency("grad-cam", model, images, "light")
     assert maps.shape == (3, 4, 4) and bool((maps >= 0).all()) and float(maps.max()) > 0
 

@@ -47,10 +47,9 @@ def test_attributions_sum_to_the_change_of_the_answer(z, weight, kind, output):
 
 def test_a_yes_or_no_has_the_same_shares_as_logit_and_as_probability(z, weight):
     probe = probe_of(weight)
-    logit, probability = (
-        factor_shares(integrated_gradients(probe, z, 0, output=output)[0], probe)
-        for output in ("logit", "probability")
-    )
+    outputs = ("logit", "probability")
+    both = (integrated_gradients(probe, z, 0, output=output)[0] for output in outputs)
+    logit, probability = (factor_shares(one, probe) for one in both)
     np.testing.assert_allclose(logit, probability, atol=1e-6)
     np.testing.assert_allclose(logit.sum(axis=1), 1)
 

@@ -29,9 +29,8 @@ def test_level_depth_loses_its_slope_from_top_to_bottom_and_nothing_else(generat
     across = raw + 0.3 * torch.linspace(-1, 1, 64)
     assert (depth_from_raw(across, level) - depth_from_raw(raw, level)).abs().max() > 0.02
     ridge = (raw * 0 + torch.exp(-((down * 3) ** 2))).contiguous()  # the same above and below: no slope
-    torch.testing.assert_close(
-        depth_from_raw(ridge, level), depth_from_raw(ridge, SceneRanges(border_share=0))
-    )
+    plain = SceneRanges(border_share=0)
+    torch.testing.assert_close(depth_from_raw(ridge, level), depth_from_raw(ridge, plain))
 
 
 def test_a_flat_map_leans_back_by_the_angle_asked_for():
@@ -39,9 +38,8 @@ def test_a_flat_map_leans_back_by_the_angle_asked_for():
     depth = depth_from_raw(torch.zeros(1, 1, 64, 64), leaning)[0]
     height = depth[31:33] * torch.tensor([[0.5], [-0.5]]) / (63 / 2 / math.tan(math.radians(5)))
     lean = (depth[31] - depth[32]) / (height[0] - height[1])  # away for every unit up, in the middle
-    torch.testing.assert_close(
-        lean, torch.full((64,), math.tan(math.radians(30))), rtol=2e-3, atol=0, check_dtype=False
-    )
+    expected = torch.full((64,), math.tan(math.radians(30)))
+    torch.testing.assert_close(lean, expected, rtol=2e-3, atol=0, check_dtype=False)
     assert (depth[:-1] > depth[1:]).all()
     upright = depth_from_raw(torch.zeros(1, 1, 64, 64), SceneRanges(border_share=0, level_depth=True))
     torch.testing.assert_close(depth + depth.flip(0), 2 * upright[0])

@@ -66,11 +66,8 @@ def confidence_net() -> dict[str, Tensor]:
     first: list[nn.Module] = []
     for before, after in ((2 * WIDTH, WIDTH), (WIDTH, WIDTH)):
         first += [deconv(before, after), norm(after), nn.ReLU()]
-    parts = {
-        "network": nn.Sequential(*trunk),
-        "head1": nn.Sequential(*first, conv(WIDTH, 2, 5)),
-        "head2": nn.Sequential(conv(2 * WIDTH, 2, 3)),
-    }
+    heads = {"head1": [*first, conv(WIDTH, 2, 5)], "head2": [conv(2 * WIDTH, 2, 3)]}
+    parts = {name: nn.Sequential(*layers) for name, layers in {"network": trunk, **heads}.items()}
     return nn.ModuleDict(parts).state_dict()
 
 
@@ -82,9 +79,8 @@ def checkpoint() -> dict:
         nets = {"netD": map_net(1), "netA": map_net(3), "netL": vector_net(4), "netV": vector_net(6)}
         states = {name: nn.ModuleDict({"network": net}).state_dict() for name, net in nets.items()}
         states["netC"] = confidence_net()
-    optimisers = {
-        f"optimizer{name[-1]}": torch.optim.Adam(net.parameters()).state_dict() for name, net in nets.items()
-    }
+    adams = {name: torch.optim.Adam(net.parameters()) for name, net in nets.items()}
+    optimisers = {f"optimizer{name[-1]}": adam.state_dict() for name, adam in adams.items()}
     return {**states, **optimisers, "epoch": 30}
 
 
@@ -134,11 +130,8 @@ def saved(content: object, folder: Path, **options) -> Path:
 
 def test_files_of_old_torch_and_flat_names_are_read_too(checkpoint, file, tmp_path):
     _, expected = read_checkpoint(file)
-    flat = {
-        f"{net}.{name}": value
-        for net in ("netD", "netA", "netL", "netV")
-        for name, value in checkpoint[net].items()
-    }
+    nets = ("netD", "netA", "netL", "netV")
+    flat = {f"{net}.{name}": value for net in nets for name, value in checkpoint[net].items()}
     _, found = read_checkpoint(saved(flat, tmp_path, _use_new_zipfile_serialization=False))
     assert found and all(torch.equal(found[name], expected[name]) for name in found)
     assert not any(name.startswith("nets.confidence") for name in found)
@@ -175,9 +168,7 @@ def test_objects_beside_the_weights_are_neither_run_nor_in_the_way(checkpoint, f
 def test_another_architecture_is_named_by_its_first_tensor(checkpoint, tmp_path):
     changed = dict(checkpoint["netA"])
     changed["network.3.weight"] = torch.zeros(5, 5)
-    with pytest.raises(
-        ValueError, match=r"netA has network.3.weight of shape \(5, 5\) where \(16, 8, 4, 4\)"
-    ):
+    with pytest.raises(ValueError, match=r"netA has network.3.weight of shape \(5, 5\) where \(16, 8, 4, "):
         read_checkpoint(saved({**checkpoint, "netA": changed}, tmp_path))
     shorter = dict(list(checkpoint["netV"].items())[:-1])
     with pytest.raises(ValueError, match="netV has 5 tensors, expected 6"):
@@ -205,13 +196,12 @@ def test_files_that_are_no_checkpoint_say_what_they_are(checkpoint, tmp_path):
 
 def test_the_command_writes_a_model_that_loads(file, tmp_path, capsys):
     out = tmp_path / "imported"
-    assert (
-        main(["import", str(file), "--preset", "cars", "--set", "translation_z=0.1", "--out", str(out)]) == 0
-    )
+    words = ["import", str(file), "--out", str(out)]
+    assert main([*words, "--preset", "cars", "--set", "translation_z=0.1"]) == 0
     ranges = load(out).settings.ranges
     assert (ranges.border_depth, ranges.diffuse, ranges.translation_z) == (1.08, (0.5, 1.0), 0.1)
     assert "a checkpoint of unsup3d" in (out / "README.md").read_text()
-    assert main(["import", str(file), "--out", str(out)]) == 2
+    assert main(words) == 2
     assert "add --force" in capsys.readouterr().err
     assert main(["import", str(file), "--preset", "dogs", "--out", str(tmp_path / "no")]) == 2
     assert not (tmp_path / "no").exists()

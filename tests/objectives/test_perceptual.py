@@ -56,9 +56,8 @@ def test_sigma_of_another_resolution_is_refused(generator):
 def test_features_are_normalised_pictures_through_the_layers(generator):
     net = Tiny(generator)
     images = torch.rand(2, 3, 6, 8, generator=generator)
-    normalised = torch.stack(
-        [(images[:, c] - m) / s for c, (m, s) in enumerate([(0.5, 0.2), (0.4, 0.3), (0.3, 0.4)])], 1
-    )
+    channels = enumerate([(0.5, 0.2), (0.4, 0.3), (0.3, 0.4)])
+    normalised = torch.stack([(images[:, c] - mean) / std for c, (mean, std) in channels], 1)
     torch.testing.assert_close(net(images), net.features(normalised))
 
 

@@ -7,15 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from derender.objectives import reconstruction
 from derender.objectives.perceptual import perceptual_loss
-from derender.objectives.reconstruction import (
-    SIGMA_FLOOR,
-    bounded_sigma,
-    depth_curvature,
-    depth_smoothness,
-    masked_l1,
-    photometric_loss,
-)
+from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
@@ -94,15 +88,12 @@ def test_pixel_by_pixel_definition(generator):
             for u in range(7):
                 if mask[n, v, u]:
                     error = sum(abs((prediction - target)[n, c, v, u].item()) for c in range(3)) / 3
-                    spread = math.hypot(sigma[n, 0, v, u].item(), SIGMA_FLOOR)
+                    spread = math.hypot(sigma[n, 0, v, u].item(), reconstruction.SIGMA_FLOOR)
                     total += math.sqrt(2) * error / spread + math.log(spread)
                     count += 1
     assert 0 < count < mask.numel()
-    torch.testing.assert_close(
-        photometric_loss(prediction, target, mask, sigma),
-        torch.tensor(total / count, dtype=torch.float64),
-        **EXACT,
-    )
+    expected = torch.tensor(total / count, dtype=torch.float64)
+    torch.testing.assert_close(photometric_loss(prediction, target, mask, sigma), expected, **EXACT)
 
 
 def test_the_mean_runs_over_all_kept_pixels_of_the_batch_not_over_images(generator):
@@ -118,9 +109,9 @@ def test_the_mean_runs_over_all_kept_pixels_of_the_batch_not_over_images(generat
 @given(st.floats(0, 1e4))
 @settings(max_examples=50, deadline=None)
 def test_bounded_sigma_stays_above_the_floor_and_close_to_sigma(value):
-    result = bounded_sigma(torch.tensor([value], dtype=torch.float64)).item()
-    assert result >= max(SIGMA_FLOOR, value) * (1 - 1e-12)
-    assert result - value <= SIGMA_FLOOR
+    result = reconstruction.bounded_sigma(torch.tensor([value], dtype=torch.float64)).item()
+    assert result >= max(reconstruction.SIGMA_FLOOR, value) * (1 - 1e-12)
+    assert result - value <= reconstruction.SIGMA_FLOOR
     if value >= 0.1:
         assert result == pytest.approx(value, rel=1e-4)
 

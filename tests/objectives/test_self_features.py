@@ -6,24 +6,16 @@ from safetensors.torch import save_file
 from torch import Generator, nn
 from torch.nn import functional
 
-from derender.objectives.self_features import (
-    SelfFeatures,
-    SelfTraining,
-    load_self_features,
-    train_self_features,
-    trunk,
-    two_views,
-    without_normalisation,
-)
+from derender.objectives import self_features
+from derender.objectives.self_features import SelfTraining, load_self_features, train_self_features
 
 QUICK = SelfTraining(widths=(8, 8, 16), batch=8, places=8, crop=24, projection=16)
 
 
 def blobs(n: int, generator: Generator, size: int = 32) -> torch.Tensor:
     """Images of smooth random colour with a few sharp discs: detail at several scales."""
-    smooth = functional.interpolate(torch.rand(n, 3, 5, 5, generator=generator), size, mode="bicubic").clamp(
-        0, 1
-    )
+    coarse = torch.rand(n, 3, 5, 5, generator=generator)
+    smooth = functional.interpolate(coarse, size, mode="bicubic").clamp(0, 1)
     row = torch.arange(size).view(1, size, 1)
     column = torch.arange(size).view(1, 1, size)
     for _ in range(6):
@@ -40,14 +32,12 @@ def as_bytes(images: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize(("height", "width"), [(32, 32), (64, 48), (20, 33)])
 def test_places_of_two_views_show_the_same_point(monkeypatch, generator, height, width):
-    monkeypatch.setattr(
-        "derender.objectives.self_features.photometric_augmentation", lambda images, generator: images
-    )
+    monkeypatch.setattr(self_features, "photometric_augmentation", lambda images, generator: images)
     n, stride = 40, 4
     rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
     number = torch.arange(float(n)).view(n, 1, 1).expand(n, height, width)
     pictures = torch.stack([rows.expand(n, -1, -1), columns.expand(n, -1, -1), number], dim=1)
-    pair = two_views(pictures, 40, stride, 12, generator)
+    pair = self_features.two_views(pictures, 40, stride, 12, generator)
     cells = pair.first.shape[-1] // stride
     first, second = (
         functional.avg_pool2d(view, stride).flatten(2).gather(2, places[:, None].expand(n, 3, 12))
@@ -63,7 +53,7 @@ def test_places_of_two_views_show_the_same_point(monkeypatch, generator, height,
 
 def test_folding_the_normalisation_changes_nothing(generator):
     widths = (4, 6, 5)
-    layers = trunk(widths, normalised=True).train()
+    layers = self_features.trunk(widths, normalised=True).train()
     for module in layers:
         if isinstance(module, nn.BatchNorm2d):
             nn.init.normal_(module.weight, 1, 0.3, generator=generator)
@@ -73,7 +63,7 @@ def test_folding_the_normalisation_changes_nothing(generator):
             layers(torch.rand(8, 3, 16, 12, generator=generator))
         layers.eval()
         images = torch.rand(2, 3, 16, 12, generator=generator)
-        folded = without_normalisation(layers, widths)
+        folded = self_features.without_normalisation(layers, widths)
         torch.testing.assert_close(folded(images), layers(images), rtol=1e-4, atol=1e-5)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in folded)
 
@@ -96,15 +86,13 @@ def test_the_same_seed_gives_the_same_weights_and_global_state_is_left_alone(gen
 def test_training_learns_to_recognise_places_and_to_order_distortions(generator):
     """After a hundred steps: places are recognised, detail and position count, brightness hardly does."""
     pictures, unseen = as_bytes(blobs(96, generator)), blobs(24, generator)
-    losses = []
-    trained = train_self_features(
-        pictures, seed=0, steps=100, settings=QUICK, progress=lambda step, steps, loss: losses.append(loss)
-    )
+    losses: list[float] = []
+    how = {"settings": QUICK, "progress": lambda step, steps, loss: losses.append(loss)}
+    trained = train_self_features(pictures, seed=0, steps=100, **how)
     assert len(losses) == 100
     assert sum(losses[-10:]) / 10 < sum(losses[:10]) / 10 - 1.0
-    untrained = train_self_features(
-        pictures, seed=0, steps=1, settings=SelfTraining(**{**vars(QUICK), "learning_rate": 1e-12})
-    )
+    still = SelfTraining(**{**vars(QUICK), "learning_rate": 1e-12})
+    untrained = train_self_features(pictures, seed=0, steps=1, settings=still)
 
     def distances(net):
         target = net(unseen)
@@ -150,4 +138,4 @@ def test_bad_input_is_named(generator):
     with pytest.raises(ValueError, match="8 x 32 are too small"):
         train_self_features(images[:, :, :8], seed=0, steps=1)
     with pytest.raises(ValueError, match="three positive widths"):
-        SelfFeatures((8, 0, 8))
+        self_features.SelfFeatures((8, 0, 8))

@@ -22,9 +22,8 @@ def bump(light=(0.4, 0.5, 0.2, 0.3), camera=(0.05, 0.15, 0.02, 0.01, -0.01, 0.0)
     along = torch.linspace(-1, 1, SMALL)
     radius = along**2 + along[:, None] ** 2
     depth = 1.03 - 0.06 * (-2.5 * radius).exp()
-    albedo = torch.stack(
-        (0.5 + 0.2 * torch.sin(5 * along).expand(SMALL, -1), 0.6 + 0 * radius, 0.4 + 0.1 * radius / 2)
-    )
+    red = 0.5 + 0.2 * torch.sin(5 * along).expand(SMALL, -1)
+    albedo = torch.stack((red, 0.6 + 0 * radius, 0.4 + 0.1 * radius / 2))
     return Scene(depth[None], albedo[None], torch.tensor([light]), torch.tensor([camera]))
 
 
@@ -125,9 +124,8 @@ def test_effects_that_the_model_knows_are_taken_off_and_drawn_anew(name):
     renderer = renderer_named(name)
     extra = {"specular": torch.tensor([[0.4, 12.0]]), "haze": torch.tensor([[1.5, 0.9]])}
     wanted = {row.parameter for row in renderer.factors}
-    scene = Scene.from_parameters(
-        bump().parameters | {key: value for key, value in extra.items() if key in wanted}
-    )
+    own = {key: value for key, value in extra.items() if key in wanted}
+    scene = Scene.from_parameters(bump().parameters | own)
     if "environment" in wanted:
         scene = Scene.from_parameters(scene.parameters | {"environment": from_light(scene.light)})
     noise = torch.rand(3, LARGE, LARGE, generator=torch.Generator().manual_seed(0))

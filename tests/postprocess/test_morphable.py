@@ -53,11 +53,8 @@ def test_examples_that_are_all_the_same_have_coordinates_of_0():
     torch.testing.assert_close(model.maps("depth", torch.ones(2, model.size("depth"))), maps[:2])
 
 
-def test_one_example_is_too_few():
+def test_one_example_and_axes_of_another_shape_are_refused():
     with pytest.raises(ValueError, match="2 examples or more, got 1"):
         MorphableMaps.of({"depth": torch.zeros(1, 4, 4)}, 2)
-
-
-def test_axes_of_another_shape_are_refused():
     with pytest.raises(ValueError, match="depth: axes of"):
         MorphableMaps({"depth": torch.zeros(4, 4)}, {"depth": torch.zeros(2, 4, 5)})

@@ -51,15 +51,11 @@ def pixel_grid(height: int, width: int, dtype: torch.dtype = torch.float64) -> T
     return torch.stack((u, v), dim=-1).to(dtype)
 
 
-def assert_empty_where_uncovered(result: Rendering | Fragments) -> None:
+def assert_empty_outside(result: Rendering | Fragments) -> None:
     """Mask is 0 or 1, everything finite, and nothing but zeros outside the mask."""
     assert ((result.mask == 0) | (result.mask == 1)).all()
     outside = result.mask == 0
-    maps = (
-        (result.depth, result.image.movedim(1, -1))
-        if isinstance(result, Rendering)
-        else (result.depth, result.uv)
-    )
-    for values in maps:
+    places = result.image.movedim(1, -1) if isinstance(result, Rendering) else result.uv
+    for values in (result.depth, places):
         assert values.isfinite().all()
         assert (values[outside] == 0).all()

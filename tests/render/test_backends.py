@@ -25,13 +25,10 @@ needs_numba = pytest.mark.skipif("numba" not in available_backends(), reason="nu
 
 @pytest.fixture
 def nan_filled_memory():
-    """Memory handed out uninitialised holds NaN (and the largest integer) for the length of a test."""
-    was = torch.are_deterministic_algorithms_enabled()
+    """Memory handed out uninitialised holds NaN (and the largest integer) until the end of the test."""
     torch.use_deterministic_algorithms(True)
     assert torch.utils.deterministic.fill_uninitialized_memory
     assert torch.empty(3).isnan().all()
-    yield
-    torch.use_deterministic_algorithms(was)
 
 
 def assert_agrees_with_reference(fast_backend: str, values: tuple[Tensor, ...], function=render) -> None:
@@ -130,12 +127,9 @@ def test_operators_keep_torch_s_rules(backend, generator):
     _, distance, _, triangle = FORWARD[backend](albedo, depth, rotation, offset, 20.0)
     picture = torch.randn(2, 3, 5, 6, generator=generator).to(device)
     lamp = torch.rand(2, 5, generator=generator).to(device)
-    checks = {
-        "shade": (depth, albedo, lamp, 20.0),
-        "shade_backward": (picture, depth, albedo, lamp, 20.0),
-        "warp": (albedo, depth, rotation, offset, 20.0),
-        "warp_backward": (picture, distance.detach(), albedo, depth, rotation, offset, triangle, 20.0),
-    }
+    shaded, warped = (depth, albedo, lamp, 20.0), (albedo, depth, rotation, offset)
+    checks = {"shade": shaded, "shade_backward": (picture, *shaded), "warp": (*warped, 20.0)}
+    checks["warp_backward"] = (picture, distance.detach(), *warped, triangle, 20.0)
     for name, values in checks.items():
         operator, _, direction = name.partition("_")
         whole_name = f"{operator}_{backend}{'_' * bool(direction)}{direction}"
@@ -218,9 +212,8 @@ def test_kernels_are_compiled_where_no_folder_can_cache_them():
     from derender.render.numba_threads import kernel
 
     namespace = {"kernel": kernel}
-    exec(
-        "@kernel\ndef count(values, start, stop):\n    values[start:stop] += 1", namespace
-    )  # no file, no cache
+    code = "@kernel\ndef count(values, start, stop):\n    values[start:stop] += 1"
+    exec(code, namespace)  # no file, no cache
     values = torch.zeros(5, dtype=torch.float64)
     namespace["count"](values.numpy(), 1, 4)
     assert values.tolist() == [0, 1, 1, 1, 0]

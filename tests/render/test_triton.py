@@ -17,14 +17,7 @@ from tests.tolerances import assert_agrees
 
 from derender.render import available_backends, triton_launch
 from derender.render.backends import INSTALLED
-from derender.render.triton_launch import (
-    ADD,
-    ADD_INTEGERS,
-    MEASURE,
-    float64_bits,
-    interpreted,
-    scattered_sums,
-)
+from derender.render.triton_launch import ADD, ADD_INTEGERS, MEASURE, interpreted, scattered_sums
 
 ROOT = Path(__file__).resolve().parents[2]
 INTERPRETED = (
@@ -66,9 +59,7 @@ def test_several_programs_for_an_image_change_nothing(monkeypatch, generator):
 
 @pytest.fixture
 def deterministic():
-    torch.use_deterministic_algorithms(True)
-    yield
-    torch.use_deterministic_algorithms(False)
+    torch.use_deterministic_algorithms(True)  # until the end of the test
 
 
 def gradients_of(values, backend: str, columns: int) -> tuple[torch.Tensor, ...]:
@@ -90,10 +81,7 @@ def test_where_nothing_is_added_repeatable_gradients_are_nothing(generator):
     values = scene(1, 6, 9, generator)
     right = gradients_of(values, "reference", 3)[:2]
     torch.use_deterministic_algorithms(True)
-    try:
-        found = gradients_of(values, "triton", 3)[:2]
-    finally:
-        torch.use_deterministic_algorithms(False)
+    found = gradients_of(values, "triton", 3)[:2]
     for expected, actual in zip(right, found, strict=True):
         assert (expected == 0).any() and (actual[expected == 0] == 0).all()
         assert_agrees(actual, expected)
@@ -105,12 +93,11 @@ def adding(values: torch.Tensor, order: torch.Tensor):
     def run(mode, units, largest, targets) -> None:
         for n, summands in enumerate(values.flatten(1)[:, order].double()):
             if mode == MEASURE:
-                largest[n, 0] = max(float64_bits(abs(float(summand))) for summand in summands)
+                largest[n, 0] = max(triton_launch.float64_bits(abs(float(summand))) for summand in summands)
                 continue
             for summand in summands:
-                targets[0][n] += (
-                    torch.floor(summand * units[n, 0] + 0.5).long() if mode == ADD_INTEGERS else summand
-                )
+                whole = mode == ADD_INTEGERS
+                targets[0][n] += torch.floor(summand * units[n, 0] + 0.5).long() if whole else summand
                 assert mode in (ADD, ADD_INTEGERS)
 
     return run
@@ -123,9 +110,8 @@ def test_integer_sums_have_no_order_and_lose_nothing_that_counts(scale, shape, g
     values[0] = 0
     values[2] *= 1e-9  # each image by a unit of its own
     orders = [torch.randperm(20, generator=generator) for _ in range(2)]
-    one, other = (
-        scattered_sums(adding(values, order), values, [shape], [torch.float64])[0] for order in orders
-    )
+    kernels = (adding(values, order) for order in orders)
+    one, other = (scattered_sums(kernel, values, [shape], [torch.float64])[0] for kernel in kernels)
     assert torch.equal(one, other) and (one[0] == 0).all()
     torch.use_deterministic_algorithms(False)
     expected = scattered_sums(adding(values, orders[0]), values, [shape], [torch.float64])[0]

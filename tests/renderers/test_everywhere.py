@@ -22,13 +22,11 @@ RENDERERS = ("phong+haze", "sh")
 @pytest.fixture(scope="module", params=RENDERERS)
 def model(request) -> Derenderer:
     """An untrained model with whitening and fitting of noise."""
-    net = Derenderer.from_preset(
-        "small", seed=0, image_size=SIZE, width=4, light_width=4, renderer=request.param
-    )
+    sizes = {"image_size": SIZE, "width": 4, "light_width": 4}
+    net = Derenderer.from_preset("small", seed=0, renderer=request.param, **sizes)
     images = torch.rand(12, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
-    settings = FeatureSettings.model_validate(
-        {"whitening": {"pictures": 12}, "fitting": {"examples": 12, "coordinates": 4}}
-    )
+    few = {"whitening": {"pictures": 12}, "fitting": {"examples": 12, "coordinates": 4}}
+    settings = FeatureSettings.model_validate(few)
     return make_features(net.eval().requires_grad_(False), images, settings)
 
 
@@ -56,13 +54,9 @@ def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generato
         for column, number in enumerate(row.numbers):
             own = float(scene.parameters[row.parameter][0, column])
             assert written[row.name][number.name] == pytest.approx(own)
-    one, other = (
-        OpenedImage(
-            tmp_path / str(at), as_bytes(images[at]), Frame.centred(SIZE, SIZE), {}, scene[at], model.render,
-            None, (0.9, 1.1),
-        )
-        for at in range(2)
-    )  # fmt: skip
+    whole = Frame.centred(SIZE, SIZE)
+    opened = ((tmp_path / str(at), as_bytes(images[at]), whole, {}, scene[at]) for at in range(2))
+    one, other = (OpenedImage(*each, model.render, None, (0.9, 1.1)) for each in opened)
     swaps = swapped_factors(model, one, other)
     assert list(swaps.stills) == [f"its {row.name}" for row in model.factors]
     drawn = {np.asarray(one).tobytes() for one in (*swaps.stills.values(), swaps.inputs["reconstruction"])}

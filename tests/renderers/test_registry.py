@@ -76,9 +76,8 @@ def test_a_name_that_is_none_says_what_to_write(name, message):
 
 
 def test_a_users_module_is_imported_except_for_a_downloaded_model(tmp_path, monkeypatch):
-    (tmp_path / "my_glow.py").write_text(
-        "from derender.renderers import Renderer\nGLOW = Renderer('glow', gamma=2.0)\n"
-    )
+    text = "from derender.renderers import Renderer\nGLOW = Renderer('glow', gamma=2.0)\n"
+    (tmp_path / "my_glow.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     name = "my_glow:GLOW"
     folder = Derenderer.from_preset("small", seed=0, renderer=name, **TINY).save(tmp_path / "m")
@@ -116,13 +115,8 @@ def test_a_run_is_resumed_with_its_renderer(tmp_path):
 
 
 def _scene(**extra) -> Scene:
-    return Scene(
-        torch.ones(1, 8, 8),
-        torch.ones(1, 3, 8, 8),
-        torch.tensor([[0.5, 0.5, 0, 0]]),
-        torch.zeros(1, 6),
-        extra,
-    )
+    maps, light = (torch.ones(1, 8, 8), torch.ones(1, 3, 8, 8)), torch.tensor([[0.5, 0.5, 0, 0]])
+    return Scene(*maps, light, torch.zeros(1, 6), extra)
 
 
 def test_a_renderer_refuses_scenes_that_are_not_its_own():

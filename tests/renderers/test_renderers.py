@@ -102,9 +102,8 @@ def flat(light: list[float], yaw: float = 0.0, side: int = 9, **extra: Tensor) -
     """A white plane that faces the canonical camera."""
     plane, camera = torch.ones(1, side, side).double(), torch.zeros(1, 6).double()
     camera[0, 1] = yaw
-    return Scene(
-        plane, plane[:, None].expand(1, 3, -1, -1), torch.tensor([light], dtype=torch.float64), camera, extra
-    )
+    lit = torch.tensor([light], dtype=torch.float64)
+    return Scene(plane, plane[:, None].expand(1, 3, -1, -1), lit, camera, extra)
 
 
 @pytest.mark.parametrize(("light_yaw", "camera_yaw"), [(0.0, 0.0), (0.7, 0.0), (0.7, 0.5), (0.4, -0.6)])
@@ -143,10 +142,8 @@ def test_haze_is_koschmieders_law_over_the_depths_that_are_seen():
 def test_renderers_combine_in_the_order_of_light(generator):
     given = scene_for("phong+lambert-shadow+haze", generator)
     phong, shadow = renderer_named("phong"), renderer_named("lambert-shadow")
-    both, bare = (
-        renderer_named("phong+lambert-shadow"),
-        given.with_parameters(specular=torch.tensor([[0.0, 9.0]] * 2).double()),
-    )
+    both = renderer_named("phong+lambert-shadow")
+    bare = given.with_parameters(specular=torch.tensor([[0.0, 9.0]] * 2).double())
     assert_agrees(both.shade(bare, FOV_DEG), shadow.shade(given, FOV_DEG), "without gloss")
     share = shadow.visibility(given, FOV_DEG)[:, None]
     gloss = phong.shade(given, FOV_DEG) - phong.shade(bare, FOV_DEG)
@@ -220,9 +217,8 @@ def test_harmonics_are_orthonormal_and_meet_a_lamp(generator):
     assert float((off.abs() / light[:, 1, None, None, None]).max()) < 0.1  # of the cosine lobe, known: 3/32
     dark = environment.from_light(light * torch.tensor([0, 1, 1, 1]))
     for orders, limit in zip((slice(1, 4), slice(4, 9)), environment.LIMITS, strict=True):
-        assert_agrees(
-            dark[:, orders].norm(dim=1) / dark[:, 0], torch.full((6,), limit, dtype=torch.float64), "limit"
-        )
+        expected = torch.full((6,), limit, dtype=torch.float64)
+        assert_agrees(dark[:, orders].norm(dim=1) / dark[:, 0], expected, "limit")
 
 
 def test_environments_are_bounded_and_give_way_to_a_lamp(generator):

@@ -59,9 +59,8 @@ def test_what_is_already_bright_is_not_pushed_over_1(skins):
 def test_a_model_estimates_keeps_and_applies_its_prior(tmp_path):
     model = Derenderer.from_preset("small", seed=0, image_size=32)
     images = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(1))
-    none = FeatureSettings.model_validate(
-        {"whitening": {"pictures": 0}, "fitting": {"examples": 0, "steps": 0}}
-    )
+    parts = {"whitening": {"pictures": 0}, "fitting": {"examples": 0, "steps": 0}}
+    none = FeatureSettings.model_validate(parts)
     made = make_features(model, images, none)
     again = fit_brightness(made, images)  # of the scenes as decoded, not as shared already
     assert model.settings.brightness is None and made.settings.brightness and again

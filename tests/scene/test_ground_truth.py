@@ -55,15 +55,14 @@ def truth(shared_data) -> Truth:
     inside = outside == 0
     inside[:, [0, -1]] = False
     inside[:, :, [0, -1]] = False
+    angles = columns("light_pitch", "light_yaw").deg2rad()
     return Truth(
         image=image / 255,
         depth=0.8 + depth / 65535 * 0.4,
         normal=torch.nn.functional.normalize(normal / 255 * 2 - 1, dim=-1),
         albedo=albedo / 255,
         inside=inside,
-        light=torch.cat(
-            (columns("ambient", "diffuse"), columns("light_pitch", "light_yaw").deg2rad()), dim=1
-        ),
+        light=torch.cat((columns("ambient", "diffuse"), angles), dim=1),
         rotation=rotation_matrix(columns("pitch", "yaw", "roll").deg2rad()),
         light_direction=columns("lx", "ly", "lz"),
         light_direction_cam=columns("lx_cam", "ly_cam", "lz_cam"),

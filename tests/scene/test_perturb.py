@@ -7,14 +7,8 @@ import pytest
 import torch
 from torch import Generator
 
-from derender.scene.perturb import (
-    PerturbSettings,
-    choose_factors,
-    derangement,
-    exchange,
-    perturb_camera,
-    perturb_light,
-)
+from derender.scene import perturb as perturbing
+from derender.scene.perturb import PerturbSettings, choose_factors, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
 
 MANY = 20_000
@@ -96,7 +90,7 @@ def test_the_generator_alone_decides(perturb):
 
 
 def test_derangements_fix_nothing_and_are_uniform(generator):
-    counts = Counter(tuple(derangement(4, generator).tolist()) for _ in range(4500))
+    counts = Counter(tuple(perturbing.derangement(4, generator).tolist()) for _ in range(4500))
     assert len(counts) == 9
     for order in counts:
         assert sorted(order) == [0, 1, 2, 3] and all(i != place for i, place in enumerate(order))

@@ -3,9 +3,11 @@
 import shutil
 from pathlib import Path
 
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
+from huggingface_hub.errors import HFValidationError, LocalTokenNotFoundError
 
 import derender
 from derender.model import Derenderer
@@ -56,16 +58,10 @@ class FakeHub:
 
 @pytest.fixture
 def fake(tmp_path, monkeypatch) -> FakeHub:
-    import huggingface_hub
-
     made = FakeHub(tmp_path / "hub")
     monkeypatch.setattr(hub, "client", lambda token: made)
     monkeypatch.setattr(huggingface_hub, "snapshot_download", made.snapshot_download)
     return made
-
-
-def with_errors(folder: Path) -> Path:
-    return write_errors(folder, HeldOutErrors(np.linspace(0.01, 0.11, 101), 1234))
 
 
 def test_a_pushed_model_comes_back_the_same_with_a_card(model, fake):
@@ -85,7 +81,8 @@ def test_a_pushed_model_comes_back_the_same_with_a_card(model, fake):
 
 
 def test_card_and_errors_go_with_the_weights_they_belong_to(model, tmp_path):
-    first = with_errors(model.save_pretrained(tmp_path / "first", **MINE)).parent
+    first = model.save_pretrained(tmp_path / "first", **MINE)
+    write_errors(first, HeldOutErrors(np.linspace(0.01, 0.11, 101), 1234))
     loaded = derender.load(first)
     second = loaded.save_pretrained(tmp_path / "second")
     assert (second / "README.md").read_text() == (first / "README.md").read_text()
@@ -106,9 +103,6 @@ def test_saving_over_the_folder_it_came_from_keeps_the_card(model, tmp_path):
 
 
 def test_what_the_hub_refuses_is_one_sentence(model, fake, monkeypatch):
-    from huggingface_hub import HfApi
-    from huggingface_hub.errors import HFValidationError, LocalTokenNotFoundError
-
     with pytest.raises(ValueError, match="has no card: state what it was trained on"):
         model.push_to_hub("me/faces", data="mugs")
     assert not fake.asked
@@ -118,6 +112,7 @@ def test_what_the_hub_refuses_is_one_sentence(model, fake, monkeypatch):
     fake.fails = LocalTokenNotFoundError("Token is required")
     with pytest.raises(PermissionError, match="log in with 'hf auth login'"):
         model.push_to_hub("a/b", **MINE)
-    monkeypatch.setattr(hub, "client", lambda token: HfApi(endpoint="http://127.0.0.1:9", token="x"))
+    nowhere = huggingface_hub.HfApi(endpoint="http://127.0.0.1:9", token="x")
+    monkeypatch.setattr(hub, "client", lambda token: nowhere)
     with pytest.raises(ConnectionError, match=r"cannot be reached .* model.save_pretrained writes the same"):
         model.push_to_hub("me/faces", **MINE)

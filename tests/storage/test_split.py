@@ -17,6 +17,7 @@ from derender.training.run_folder import start_run
 
 RECORD = SplitRecord((0.5, 0.2, 0.3), 4)
 COPIES = ("run", "white", "again", "small")
+OTHERS = ('{"format": 2, "shares": [1, 0, 0], "seed": 0}', '{"format": 1, "shares": [1, 1, 1], "seed": 0}')
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +42,7 @@ def test_what_is_written_is_read(tmp_path):
     assert read_split(tmp_path) == RECORD
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        "[]",
-        '{"format": 2, "shares": [1, 0, 0], "seed": 0}',
-        '{"format": 1, "shares": [1, 1, 1], "seed": 0}',
-    ],
-)
+@pytest.mark.parametrize("text", ["{", "[]", *OTHERS])
 def test_a_damaged_file_is_named(tmp_path, text):
     (tmp_path / SPLIT_FILE).write_text(text)
     with pytest.raises(ValueError, match=r"split\.json is damaged or of a newer version"):

@@ -32,12 +32,6 @@ TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning
 TINY += ["warmup_images=0", "final_rate=1"]
 
 
-@pytest.fixture(autouse=True)
-def _restore_determinism():
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 @pytest.fixture(scope="module")
 def pictures() -> ImageSet:
     noise = np.random.default_rng(0)

@@ -18,12 +18,6 @@ SHORT = ["perceptual=none", "batch_size=8", "checkpoint_every=16", "validate_eve
 SHORT += ["final_rate=1", "deterministic=true"]
 
 
-@pytest.fixture(autouse=True)
-def _restore_determinism():
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 @pytest.fixture(scope="module")
 def pictures() -> ImageSet:
     images = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)

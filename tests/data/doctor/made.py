@@ -19,13 +19,9 @@ COUNT = 144
 @cache
 def generated(kind: str, count: int = COUNT) -> np.ndarray:
     """Faces of our generator under the settings that ``kind`` names."""
-    settings = {
-        "faces": {},
-        "one view and light": {"view": STILL, "light": FLAT},
-        "one view": {"view": STILL},
-        "one light": {"light": FLAT},
-        "from one side": {"view": SIDEWAYS},
-    }[kind]
+    kinds = {"faces": {}, "one view": {"view": STILL}, "one light": {"light": FLAT}}
+    kinds |= {"one view and light": {"view": STILL, "light": FLAT}, "from one side": {"view": SIDEWAYS}}
+    settings = kinds[kind]
     made = faces.generate(count, SIDE, 11, FaceSettings(pictures_per_identity=1, **settings))
     made.images.setflags(write=False)
     return made.images

@@ -127,12 +127,9 @@ def test_black_white_grey_and_empty_pictures_are_named():
 
 def test_unreadable_files_and_copies_to_the_pixel_are_counted():
     images = np.concatenate([made.generated("faces"), made.generated("faces")[:2]])
-    pictures = made.as_set(
-        images,
-        skipped=tuple(Skipped(f"{number}.jpg", "empty file") for number in range(80)),
-        duplicates=(Duplicate("00144.png", "00000.png"), Duplicate("00145.png", "00001.png")),
-    )
-    found = doctor(pictures)
+    skipped = tuple(Skipped(f"{number}.jpg", "empty file") for number in range(80))
+    copies = (Duplicate("00144.png", "00000.png"), Duplicate("00145.png", "00001.png"))
+    found = doctor(made.as_set(images, skipped=skipped, duplicates=copies))
     by_name = {finding.name: finding for finding in found.findings}
     assert found.identical == 2 and found.as_json()["near_copies"] == 0
     assert by_name["files"].level == "trouble"

@@ -3,13 +3,14 @@
 import sys
 from pathlib import Path
 
+import huggingface_hub
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image as Pillow
 
-from derender.data import read_images
+from derender.data import open_images, read_images
 
 datasets = pytest.importorskip("datasets", reason="needs the extra: pip install 'derender[huggingface]'")
 
@@ -33,26 +34,15 @@ def rows():
     """``rows(count, first)``: images of their own, a class, a number, a text, a list."""
 
     def make(count: int, first: int = 0, **more: object):
-        features = datasets.Features(
-            {
-                "photo": datasets.Image(),
-                "label": datasets.ClassLabel(names=["cat", "dog"]),
-                "age": datasets.Value("int32"),
-                "note": datasets.Value("string"),
-                "box": datasets.Sequence(datasets.Value("int32")),
-                **{name: datasets.Image() for name in more},
-            }
-        )
-        number = range(first, first + count)
+        number, whole = range(first, first + count), datasets.Value("int32")
+        kinds = {"photo": datasets.Image(), "label": datasets.ClassLabel(names=["cat", "dog"]), "age": whole}
+        kinds |= {"note": datasets.Value("string"), "box": datasets.Sequence(whole)}
+        features = datasets.Features({**kinds, **{name: datasets.Image() for name in more}})
         pictures = [Pillow.fromarray(pixels(seed)) for seed in number]
-        columns = {
-            "photo": pictures,
-            "label": [seed % 2 if seed != 3 else -1 for seed in number],
-            "age": [seed if seed != 2 else None for seed in number],
-            "note": [f"n{seed}" for seed in number],
-            "box": [[0, 1]] * count,
-            **dict.fromkeys(more, pictures),
-        }
+        columns = {"photo": pictures, "label": [seed % 2 if seed != 3 else -1 for seed in number]}
+        columns["age"] = [seed if seed != 2 else None for seed in number]
+        columns |= {"note": [f"n{seed}" for seed in number], "box": [[0, 1]] * count}
+        columns |= dict.fromkeys(more, pictures)
         return datasets.Dataset.from_dict(columns, features=features)
 
     return make
@@ -98,8 +88,6 @@ def test_saved_to_disk(rows, places):
 
 
 def test_a_stream_goes_on_in_the_middle_of_its_splits(rows, places):
-    from derender.data import open_images
-
     datasets.DatasetDict({"train": rows(5), "test": rows(3, 10)}).save_to_disk("two")
     with open_images("two::all") as stream:
         names = [sample.file for sample in stream.samples()]
@@ -136,8 +124,6 @@ def test_rows_that_only_point_at_a_file_outside_are_not_followed(places, encoded
 
 
 def test_a_path_wins_and_an_id_that_cannot_be_reached_names_both_readings(places, encoded, monkeypatch):
-    import huggingface_hub
-
     asked = []
 
     def unreachable(self, identifier, **_: object):
@@ -161,8 +147,6 @@ def test_a_path_wins_and_an_id_that_cannot_be_reached_names_both_readings(places
 
 def test_an_id_is_loaded_at_the_commit_the_hub_names(rows, places, monkeypatch):
     """The Hub stands in as a folder: the id, the commit and the configuration reach the library."""
-    import huggingface_hub
-
     datasets.DatasetDict({"train": rows(5)}).save_to_disk("hub")
     seen = []
 

@@ -6,16 +6,13 @@ from PIL import Image
 
 from derender.data.synthetic import CarSettings, FaceSettings, cars, faces, named_settings, write
 from derender.data.synthetic.lighting import EFFECTS
+from derender.data.synthetic.synthetic_set import camera_rotation_and_light
 from derender.scene.camera import pixel_rays
 
 SIDE = 48
 LIGHT = {"yaw_deg": [30, 60], "pitch_deg": [-20, 20], "ambient": [0.1, 0.1], "diffuse": [0.5, 0.5]}
-KINDS = {
-    "gloss": {"gloss": [0.2, 0.4], "exponent": [8, 32]},
-    "shadows": {"shadows": True},
-    "lamps": {"lamps": 3},
-    "haze": {"haze": [0.5, 3], "airlight": [0.5, 0.9]},
-}
+KINDS = {"gloss": {"gloss": [0.2, 0.4], "exponent": [8, 32]}, "shadows": {"shadows": True}}
+KINDS |= {"lamps": {"lamps": 3}, "haze": {"haze": [0.5, 3], "airlight": [0.5, 0.9]}}
 
 
 def made(kind: str | None, module=faces, settings=FaceSettings, count: int = 3):
@@ -51,33 +48,25 @@ def test_maps_follow_their_formulas(plain):
     inside = plain.mask
     one_lamp = 0.1 + strength * cosine
     np.testing.assert_allclose(gloss.effects["shading"][inside], one_lamp[inside], atol=2e-3)
-    np.testing.assert_allclose(
-        shadows.effects["shading"][inside],
-        (0.1 + strength * shadows.effects["visible"] * cosine)[inside],
-        atol=2e-3,
-    )
+    shaded = 0.1 + strength * shadows.effects["visible"] * cosine
+    np.testing.assert_allclose(shadows.effects["shading"][inside], shaded[inside], atol=2e-3)
     assert (lamps.effects["shading"] >= one_lamp - 2e-3)[inside].all()
     dark = (shadows.effects["visible"] < 0.5) & (cosine > 0.1) & inside
     assert 0.005 < dark.mean() < 0.3, "side light casts the nose's shadow"
     half = pixel_rays(SIDE, SIDE, 10.0).numpy()
     half = half / np.linalg.norm(half, axis=-1, keepdims=True) + light_of(plain)[:, None, None]
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    numbers = (gloss.labels[f"gloss_{name}"][:, None, None] for name in ("strength", "exponent"))
-    force, exponent = numbers
+    force, exponent = (gloss.labels[f"gloss_{name}"][:, None, None] for name in ("strength", "exponent"))
     shine = force * strength * (plain.normal * half).sum(-1).clip(0) ** exponent * (cosine > 0)
     np.testing.assert_allclose(gloss.effects["highlight"][inside], shine[inside], atol=5e-3)
     for n in range(len(plain)):
         depth, own = plain.depth[n][inside[n]], haze.effects["transmission"][n][inside[n]]
         beta = float(haze.labels["haze_beta"][n])
-        slope = np.polyfit(depth, np.log(own), 1)[0]
-        assert slope * np.ptp(depth) == pytest.approx(
-            -beta, rel=0.1
-        )  # samples reach a little farther than pixels
+        slope = np.polyfit(depth, np.log(own), 1)[0]  # samples reach a little farther than pixels
+        assert slope * np.ptp(depth) == pytest.approx(-beta, rel=0.1)
 
 
 def light_of(made) -> np.ndarray:
-    from derender.data.synthetic.synthetic_set import camera_rotation_and_light
-
     return camera_rotation_and_light(made.camera, made.light)[1].astype(np.float32)
 
 

@@ -45,10 +45,8 @@ def test_people_differ_and_pictures_of_one_person_agree_without_light():
 
 def test_each_expression_changes_the_face_in_its_own_way():
     common = {"view": AHEAD, "light": EVEN_LIGHT, "strength": (1.0, 1.0), "asymmetry": 0.0, "gaze_px": 0.0}
-    shown = {
-        name: faces.generate(3, seed=8, settings=FaceSettings(**common, expressions=(name,))).depth
-        for name in FaceSettings().expressions
-    }
+    alone = {name: FaceSettings(**common, expressions=(name,)) for name in FaceSettings().expressions}
+    shown = {name: faces.generate(3, seed=8, settings=settings).depth for name, settings in alone.items()}
     for a, b in combinations(shown, 2):
         apart = np.abs(shown[a] - shown[b])[:, 8:56, 14:50]
         assert apart.max(axis=(1, 2)).min() > 2e-3, (a, b)
@@ -58,12 +56,9 @@ def test_settings_are_respected():
     settings = FaceSettings(
         view=ViewSettings(yaw_deg=(22, 38), yaw_sd_deg=5),
         light=LightSettings(yaw_deg=(50, 70), ambient=(0.1, 0.2), diffuse=(0.9, 1.0)),
-        expressions={"happiness": 3, "fear": 1},
-        pictures_per_identity=3,
-        first_identity=7,
-        age_years=(30, 40),
-        skin_tone=(0.5, 0.6),
-    )
+        expressions={"happiness": 3, "fear": 1}, pictures_per_identity=3, first_identity=7,
+        age_years=(30, 40), skin_tone=(0.5, 0.6),
+    )  # fmt: skip
     made = faces.generate(60, image_size=16, settings=settings)
     yaw, light = np.rad2deg(made.camera[:, 1]), made.light
     assert yaw.min() >= 21.99 and yaw.max() <= 38.01 and yaw.std() > 1

@@ -164,11 +164,7 @@ def test_bad_arguments_are_named(kind, arguments, message):
 @pytest.mark.parametrize(
     ("kind_of", "setting", "message"),
     [
-        (
-            FaceSettings,
-            {"light": {"ambient": (0.7, 0.2)}},
-            "(?s)light.ambient.*must be two numbers.* within 0..1",
-        ),
+        (FaceSettings, {"light": {"ambient": (0.7, 0.2)}}, "(?s)ambient.*must be two numbers.* within 0..1"),
         (FaceSettings, {"view": {"yaw_beyond_deg": 50}}, "(?s)yaw_beyond_deg.*must lie within"),
         (FaceSettings, {"expressions": ("smug",)}, "(?s)expressions.*must be one or more of neutral"),
         (FaceSettings, {"expressions": ()}, "must be one or more"),
