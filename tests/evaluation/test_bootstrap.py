@@ -78,13 +78,9 @@ def test_features_of_equal_worth_are_called_better_by_chance_alone():
     assert 0 <= above <= 14
 
 
-def test_numbers_carry_no_resamples():
+def test_numbers_carry_no_resamples_which_need_rows():
     found = row("ours", np.ones(5), all_weights(5, 4)).numbers()
-    assert found["scores"]["accuracy"] == pytest.approx(
-        {"value": 1, "low": 1, "high": 1, "spread": float("nan")}, nan_ok=True
-    )
-
-
-def test_resampling_needs_rows():
+    expected = {"value": 1, "low": 1, "high": 1, "spread": float("nan")}
+    assert found["scores"]["accuracy"] == pytest.approx(expected, nan_ok=True)
     with pytest.raises(ValueError, match="needs a row and a resample, got 0 rows"):
         list(resamples(0))

@@ -13,18 +13,8 @@ from scipy.cluster.hierarchy import is_valid_linkage, linkage
 from sklearn.metrics import adjusted_rand_score, pairwise_distances
 
 from derender.evaluation import clustering_methods, neighbours
-from derender.evaluation import clustering_methods as ward_module
 from derender.evaluation.clustering import finch_levels
-from derender.evaluation.clustering_methods import (
-    approximation,
-    clusterings,
-    cut,
-    cut_leaves,
-    finch,
-    finch_clusters,
-    ward_in_cells,
-    ward_tree,
-)
+from derender.evaluation.clustering_methods import clusterings, cut, cut_leaves, finch, ward_tree
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import cells, finite_rows, members, nearest_rows
 
@@ -52,8 +42,8 @@ def test_ward_is_scipys_tree(rows, dimensions, seed):
 @pytest.mark.parametrize("float64_rows", [20_000, 0])
 def test_tiles_and_float32_do_not_change_the_tree(monkeypatch, float64_rows):
     features = 100 + groups(203, 1)
-    monkeypatch.setattr(ward_module, "TILE", 32)
-    monkeypatch.setattr(ward_module, "FLOAT64_ROWS", float64_rows)
+    monkeypatch.setattr(clustering_methods, "TILE", 32)
+    monkeypatch.setattr(clustering_methods, "FLOAT64_ROWS", float64_rows)
     ours, theirs = ward_tree(features), linkage(features, "ward")
     np.testing.assert_allclose(ours[:, 2], theirs[:, 2], rtol=1e-9)
     for count in (2, 7, 50):
@@ -96,7 +86,7 @@ def test_finch_is_its_authors(seed):
     assert list(ours.counts) == [int(count) for count in counts]
     for level, partition in enumerate(ours.partitions):
         assert adjusted_rand_score(theirs[:, level], partition) == 1
-    assert adjusted_rand_score(required, finch_clusters(features, 5)) == 1
+    assert adjusted_rand_score(required, clustering_methods.finch_clusters(features, 5)) == 1
 
 
 def test_finch_levels_are_nested_and_scored_beside_chance():
@@ -168,8 +158,9 @@ def test_nearest_rows_by_cells_are_mostly_the_nearest(many, monkeypatch):
 
 def test_ward_by_cells_is_ward_where_no_merge_crosses_a_border():
     points = groups(600, 5, count=6, apart=30)
-    found, exact = ward_in_cells(points, leaves=60, rows_per_cell=100), ward_tree(points)
-    assert is_valid_linkage(ward_tree(points)) and len(np.unique(found.leaf)) == len(found.tree) + 1 == 60
+    found = clustering_methods.ward_in_cells(points, leaves=60, rows_per_cell=100)
+    exact = ward_tree(points)
+    assert is_valid_linkage(exact) and len(np.unique(found.leaf)) == len(found.tree) + 1 == 60
     for count in (2, 4, 6):
         assert adjusted_rand_score(cut_leaves(found, count), cut(exact, count)) == 1
     with pytest.raises(ValueError, match="keeps 60 leaves of 600 rows, cannot make 61 clusters: ask"):
@@ -181,4 +172,5 @@ def test_every_method_takes_many_rows_and_says_that_it_is_approximate(many, meth
     points = groups(800, 8, count=4, apart=30)
     assert finite_rows(points, "a test").dtype == np.float32
     assert adjusted_rand_score(clusterings(points, [4], method)[4], np.arange(800) % 4) == 1
-    assert method in approximation(method, 800) and approximation(method, 300) == ""
+    told = clustering_methods.approximation
+    assert method in told(method, 800) and told(method, 300) == ""

@@ -34,9 +34,8 @@ def net(seed: int) -> Derenderer:
 
 def test_a_model_whitens_itself_as_training_does(renderings):
     found = renderings.whiten(renderings.model).whitening
-    expected = fit_whitening(
-        renderings.model, torch.from_numpy(renderings.images), SETTINGS.whitening, SETTINGS.perturb
-    )
+    images = torch.from_numpy(renderings.images)
+    expected = fit_whitening(renderings.model, images, SETTINGS.whitening, SETTINGS.perturb)
     assert found is not None and sorted(found.names) == ["albedo", "geometry"]
     for name, value in found.named_buffers():
         torch.testing.assert_close(expected.get_buffer(name), value)

@@ -133,27 +133,19 @@ class Oracle(torch.nn.Module):
 
 def ground_truth(count: int = 5, size: int = 33) -> GroundTruth:
     mask = disc(count, size).numpy()
-    return GroundTruth(
-        images=np.zeros((count, 3, size, size), np.uint8),
-        depth=np.where(mask, bumpy(count, size).numpy(), 0).astype(np.float32),
-        normal=None,
-        albedo=None,
-        mask=mask,
-        light=np.zeros((count, 4), np.float32),
-        camera=np.zeros((count, 6), np.float32),
-        files=tuple(map(str, range(count))),
-        labels={},
-    )
+    images = np.zeros((count, 3, size, size), np.uint8)
+    depth = np.where(mask, bumpy(count, size).numpy(), 0).astype(np.float32)
+    light, camera = np.zeros((count, 4), np.float32), np.zeros((count, 6), np.float32)
+    return GroundTruth(images, depth, None, None, mask, light, camera, tuple(map(str, range(count))), {})
 
 
 def test_a_model_that_knows_the_truth_scores_best_beside_its_controls():
     truth = ground_truth()
     knows = Oracle(torch.as_tensor(truth.depth), torch.as_tensor(truth.mask).float())
     flat = Oracle(torch.full((5, 33, 33), 0.7), torch.ones(5, 33, 33))
-    seen = []
-    result = evaluate_geometry(
-        knows, truth, batch_size=2, untrained=flat, progress=lambda done, total: seen.append((done, total))
-    )
+    seen: list[tuple[int, int]] = []
+    how = {"untrained": flat, "progress": lambda *at: seen.append(at)}
+    result = evaluate_geometry(knows, truth, batch_size=2, **how)
     assert result.model.side < 1e-7 and result.model.mad_deg < 1e-3 and knows.training
     assert seen == [(2, 5), (4, 5), (5, 5)]
     assert result.plane.side == pytest.approx(result.untrained.side)

@@ -1,6 +1,7 @@
 """Errors of albedo, light and camera: zero up to what no image can tell, known on closed forms."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,10 +22,8 @@ def cameras(count: int = 20, seed: int = 0, spread_rad: float = 0.3) -> torch.Te
 def turned(camera: torch.Tensor, about: torch.Tensor) -> torch.Tensor:
     """Cameras whose rotation is R @ about, as angles: R = Rz Ry Rx gives them back."""
     r = rotation_matrix(camera[:, :3].double()) @ about
-    angles = torch.stack(
-        [torch.atan2(r[:, 2, 1], r[:, 2, 2]), -torch.asin(r[:, 2, 0]), torch.atan2(r[:, 1, 0], r[:, 0, 0])],
-        dim=1,
-    )
+    x, z = torch.atan2(r[:, 2, 1], r[:, 2, 2]), torch.atan2(r[:, 1, 0], r[:, 0, 0])
+    angles = torch.stack([x, -torch.asin(r[:, 2, 0]), z], dim=1)
     return torch.cat([angles, camera[:, 3:].double()], dim=1).float()
 
 
@@ -95,28 +94,15 @@ class Oracle(torch.nn.Module):
     def render(self, scene):
         assert scene.light.tolist() == [[1, 0, 0, 0]] * len(scene)
         self.image, self.shown = scene.albedo, self.mask[self.done - len(scene) : self.done]
-        return Shown(scene.albedo, self.shown)
-
-
-class Shown:
-    def __init__(self, image, mask):
-        self.image, self.mask = image, mask
+        return SimpleNamespace(image=scene.albedo, mask=self.shown)
 
 
 def ground_truth() -> GroundTruth:
     rng = np.random.default_rng(0)
     light = np.concatenate([np.full((6, 2), 0.5), rng.uniform(-0.7, 0.7, (6, 2))], axis=1)
-    return GroundTruth(
-        images=np.zeros((6, 3, 5, 5), np.uint8),
-        depth=np.ones((6, 5, 5), np.float32),
-        normal=None,
-        albedo=rng.random((6, 3, 5, 5), np.float32),
-        mask=np.ones((6, 5, 5), bool),
-        light=light.astype(np.float32),
-        camera=cameras(6).numpy(),
-        files=tuple("abcdef"),
-        labels={},
-    )
+    images, depth, mask = np.zeros((6, 3, 5, 5), np.uint8), np.ones((6, 5, 5), "f"), np.ones((6, 5, 5), bool)
+    albedo, light, camera = rng.random((6, 3, 5, 5), np.float32), light.astype(np.float32), cameras(6).numpy()
+    return GroundTruth(images, depth, None, albedo, mask, light, camera, tuple("abcdef"), {})
 
 
 def test_a_model_that_knows_the_truth_scores_zero_and_constants_do_not():

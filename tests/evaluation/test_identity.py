@@ -51,12 +51,11 @@ def test_a_gallery_and_groups_by_other_columns(codes):
     one = identify(table(codes, camera_y_rad=yaw), factors=("code",), **how)
     assert one.values["probes"] == {"all": 108, "<= 30": 48, "beyond": 60}
     role = np.tile(["shown"] * 2 + ["probe"] * 8, PEOPLE)
-    two = identify(
-        table(codes, role=role), factors=("code",), gallery="role=shown", resamples=20, cache="none"
-    )
+    of_role = table(codes, role=role)
+    two = identify(of_role, factors=("code",), gallery="role=shown", resamples=20, cache="none")
     assert len(two.values["gallery"]) == 2 * PEOPLE and two.values["probes"] == {"all": 96}
     with pytest.raises(ValueError, match="no image has role=frontal: the gallery is empty"):
-        identify(table(codes, role=role), factors=("code",), gallery="role=frontal")
+        identify(of_role, factors=("code",), gallery="role=frontal")
     with pytest.raises(ValueError, match="bins must grow"):
         identify(table(codes), factors=("code",), bins=(50, 12))
 

@@ -14,9 +14,8 @@ ONE = {"error": (Column("error", "low"), 1.0), "good": (Column("good", "high"), 
 
 
 def test_lower_scores_are_better_by_the_controls_surplus():
-    model, plane = image_rows(
-        {"model": {"error": ERROR, "good": ERROR}, "plane": {"error": ERROR + 0.1, "good": ERROR + 0.1}}, ONE
-    )
+    more = {"error": ERROR + 0.1, "good": ERROR + 0.1}
+    model, plane = image_rows({"model": {"error": ERROR, "good": ERROR}, "plane": more}, ONE)
     one = model.scores["error"]
     half = 1.96 * ERROR.std() / 400**0.5
     assert one.value == pytest.approx(ERROR.mean())
@@ -59,8 +58,6 @@ def test_tables_are_in_the_units_of_their_columns():
     assert texts == ["2.000", "1.000-3.000", "20.0", "10.0-30.0", "0.900"] and table.caption == "3 images"
     assert table.rows[1].control and table.rows[1].note == "flat"
     assert Both().table().rows[1].cells == pytest.approx([4.0, 10.0, 1])
-    side_words, mad_words = image_verdicts(rows[0], Both.columns)
-    assert side_words.startswith(
-        "SIDE x 100: 2.000, better than the strongest control (plane), by +2.000, 95 %"
-    )
+    side, mad_words = image_verdicts(rows[0], Both.columns)
+    assert side.startswith("SIDE x 100: 2.000, better than the strongest control (plane), by +2.000, 95")
     assert mad_words.startswith("MAD: 20.0, worse than the strongest control (plane), by -10.0")

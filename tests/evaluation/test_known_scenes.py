@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from derender import Derenderer
 from derender.data import ImageSet, read_images
@@ -10,6 +11,7 @@ from derender.data.synthetic import faces
 from derender.evaluation import brightness, light, pose, relight
 from derender.evaluation.angles import agreement, known_angles, read_columns
 from derender.evaluation.bootstrap import group_resamples
+from derender.evaluation.photometry import surfaces
 from derender.scene import Scene
 
 RNG = np.random.default_rng(0)
@@ -75,18 +77,14 @@ def test_pose_is_exact_up_to_a_constant_turn(made, scenes, tmp_path):
         assert own["error"] == pytest.approx(0, abs=1e-3) and own["offset"] == pytest.approx(offset, abs=1e-3)
         assert score(found, angle, "constant answer")["slope"] == pytest.approx(0)
     names = np.array([f"elsewhere/{row}.png" for row in range(0, 24, 2)])
-    degrees = {
-        name: np.degrees(made.camera[::2, column]) for name, column in (("yaw", 1), ("pitch", 0), ("roll", 2))
-    }
+    columns = {"yaw": 1, "pitch": 0, "roll": 2}
+    degrees = {name: np.degrees(made.camera[::2, column]) for name, column in columns.items()}
     np.savez(tmp_path / "judge.npz", name=names, **degrees)
-    lines = [
-        "file,yaw,pitch,roll",
-        *(",".join(map(str, row)) for row in zip(names, *degrees.values(), strict=True)),
-    ]
+    rows = zip(names, *degrees.values(), strict=True)
+    lines = ["file,yaw,pitch,roll", *(",".join(map(str, row)) for row in rows)]
     (tmp_path / "judge.csv").write_text("\n".join(lines))
     for form in ("npz", "csv"):
-        columns = dict.fromkeys(degrees, "")
-        true, kept = known_angles(pictures(made), tmp_path / f"judge.{form}", columns)
+        true, kept = known_angles(pictures(made), tmp_path / f"judge.{form}", dict.fromkeys(degrees, ""))
         np.testing.assert_allclose(true[:, 0], degrees["yaw"], rtol=1e-5)
         assert kept.files == pictures(made).files[::2]
 
@@ -110,22 +108,15 @@ def test_a_wrong_table_is_named(tmp_path, made):
         known_angles(pictures(made), tmp_path / "few.npz", {"yaw": ""})
 
 
-def lit_people(tmp_path):
+def test_relighting_by_the_true_ratio_is_best(tmp_path):
     """Three flat grey people under three lights of growing brightness, named as Yale B."""
-    from PIL import Image
-
     for person, grey in enumerate((60, 90, 120)):
         for azimuth, gain in ((0, 1.0), (20, 0.75), (60, 0.5)):
             name = f"yaleB{person + 1:02d}_P00A{azimuth:+04d}E+00.png"
             noise = RNG.integers(-20, 20, (96, 84)) * (person + 1) / 3
             Image.fromarray(((grey + noise) * gain).clip(0, 255).astype(np.uint8)).save(tmp_path / name)
-    return tmp_path
-
-
-def test_relighting_by_the_true_ratio_is_best(tmp_path):
     model = Derenderer.from_preset("small", image_size=32, width=4, light_width=4, code_size=12).eval()
-    folder = lit_people(tmp_path)
-    found = relight(model, folder, size=32, **QUICK)
+    found = relight(model, tmp_path, size=32, **QUICK)
     psnr = {name: row["scores"]["all"]["value"] for name, row in found.values["psnr"].items()}
     assert list(psnr) == [
         "photograph relit", "model's rendering", "input", "mean image", "another person's ratio"
@@ -134,17 +125,13 @@ def test_relighting_by_the_true_ratio_is_best(tmp_path):
     columns = [column.name for column in found.tables[0].columns if column.name != "95 %"]
     assert columns == ["all", "<= 25", "<= 77"]
     with pytest.raises(ValueError, match="has no label 'identity'"):
-        relight(model, read_images(folder, 32, dataset="folder"), size=32)
+        relight(model, read_images(tmp_path, 32, dataset="folder"), size=32)
 
 
 def test_brightness_of_the_true_albedo_has_slope_1(made, scenes):
-    from derender.evaluation.photometry import surfaces
-
     skin = np.linspace(0.2, 0.9, 24)
-    scenes = scenes.with_parameters(
-        albedo=torch.tensor(skin).float()[:, None, None, None].expand(-1, 3, 32, 32),
-        camera=torch.zeros(24, 6),
-    )
+    albedo = torch.tensor(skin).float()[:, None, None, None].expand(-1, 3, 32, 32)
+    scenes = scenes.with_parameters(albedo=albedo, camera=torch.zeros(24, 6))
     seen = surfaces(knowing(scenes), made.images)
     np.testing.assert_allclose(seen["albedo"], np.repeat(skin[:, None], 3, axis=1), atol=1e-4)
     shading = scenes.light[:, 0] + scenes.light[:, 1] * scenes.light[:, 2].cos()

@@ -11,21 +11,14 @@ from scipy.special import expit, softmax
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import accuracy_score, average_precision_score, balanced_accuracy_score
 from sklearn.neighbors import KNeighborsClassifier
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 
 from derender import Derenderer
 from derender.baselines.autoencoders import Autoencoder, AutoencoderSettings
 from derender.baselines.supervised import fresh_resnet18
+from derender.evaluation import linear_probes
 from derender.evaluation.linear_finetune import finetune
-from derender.evaluation.linear_probes import (
-    HEADS,
-    PROBES,
-    HeadSettings,
-    logistic_weights,
-    majority_answers,
-    nearest_answers,
-    probe,
-    train_heads,
-)
+from derender.evaluation.linear_probes import HEADS, HeadSettings, logistic_weights, probe, train_heads
 from derender.evaluation.linear_probing import compare_linear, count_scores, linear_scores
 from derender.evaluation.linear_task import Task, choose_rows, task_of
 from derender.evaluation.memory import Memory
@@ -62,10 +55,7 @@ def test_two_values_are_asked_yes_or_no_and_more_are_a_choice():
         ({}, "at least one label column"),
         ({"a": np.ones(4)}, "two classes, the 4 labelled rows of 'a' have 1"),
         ({"a": np.array(["x", "x", "y"])}, "class 'y' of label 'a' has one row"),
-        (
-            {"a": np.array([0, 1, 2] * 2), "b": np.array([0, 1] * 3)},
-            "'a' has 3 classes and cannot be asked together",
-        ),
+        ({"a": np.arange(6) % 3, "b": np.arange(6) % 2}, "'a' has 3 classes and cannot be asked together"),
     ],
 )
 def test_tasks_that_cannot_be_asked(labels, message):
@@ -132,11 +122,9 @@ def test_heads_trained_at_once_are_those_trained_one_by_one_in_plain_torch(kind)
                 logits = head(x[batch])
                 if kind == "labels":
                     known = y[batch] >= 0
-                    loss = torch.nn.functional.binary_cross_entropy_with_logits(
-                        logits[known], y[batch][known].float()
-                    )
+                    loss = binary_cross_entropy_with_logits(logits[known], y[batch][known].float())
                 else:
-                    loss = torch.nn.functional.cross_entropy(logits, y[batch].argmax(dim=1))
+                    loss = cross_entropy(logits, y[batch].argmax(dim=1))
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -207,7 +195,7 @@ def test_a_centred_head_does_not_see_where_features_lie():
     np.testing.assert_allclose(straight[1], alone[0], atol=1e-5)
 
 
-@pytest.mark.parametrize("head", PROBES)
+@pytest.mark.parametrize("head", linear_probes.PROBES)
 def test_nothing_of_the_test_part_reaches_what_is_learned(head):
     """Other features and labels for some of the tested rows leave the answers for all others as they were."""
     features, columns = problem(80)
@@ -227,7 +215,8 @@ def test_neighbours_are_scikit_learns():
     centred = features - features[:50].mean(axis=0)
     oracle = KNeighborsClassifier(7, metric="cosine").fit(centred[:50], targets[:50])
     expected = np.stack([share[:, 1] for share in oracle.predict_proba(centred[50:])], axis=1)
-    np.testing.assert_allclose(nearest_answers(features[:50], targets[:50], features[50:], 7), expected)
+    found = linear_probes.nearest_answers(features[:50], targets[:50], features[50:], 7)
+    np.testing.assert_allclose(found, expected)
 
 
 @st.composite
@@ -296,9 +285,8 @@ def test_features_that_hold_the_labels_are_above_every_control(tmp_path):
     assert ours.versus["accuracy"].above and ours.versus["balanced_accuracy"].above
     assert ours.scores["accuracy"].value > 0.85 and ours.runs == 3 and ours.scores["accuracy"].deviation > 0
     assert noise.scores["balanced_accuracy"].value == pytest.approx(0.5, abs=0.08)
-    expected = linear_scores(
-        task.targets[rows.test], majority_answers(task, rows.train[60], 100)[0], "labels"
-    )
+    answers = linear_probes.majority_answers(task, rows.train[60], 100)[0]
+    expected = linear_scores(task.targets[rows.test], answers, "labels")
     assert majority.scores["balanced_accuracy"].value == 0.5 and expected.balanced_accuracy == 0.5
     assert majority.control and found.n_test == 100
     made = memory.made
@@ -346,9 +334,7 @@ def test_bright_and_dark_pictures_are_learned_through_the_encoders(kind):
     task = task_of({"bright": bright.astype(np.int8)})
     rows, tested, done = np.arange(16), np.arange(16, 32), []
     options = {"settings": HeadSettings(learning_rate=3e-3, epochs=8, batch_size=8), "seed": 3}
-    answers = finetune(
-        model, images, task, rows, tested, progress=lambda at, total: done.append((at, total)), **options
-    )
+    answers = finetune(model, images, task, rows, tested, progress=lambda *at: done.append(at), **options)
     assert linear_scores(task.targets[tested], answers, "labels").accuracy == 1
     assert done[-1] == (8, 8)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())

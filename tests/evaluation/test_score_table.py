@@ -56,20 +56,14 @@ def test_rows_must_fit_the_columns():
         ScoreTable("", "", [Column("a")], [Row("ours", [1, 2])])
 
 
-TABLE = ScoreTable(
-    "Scores_of 50 % | all",
-    "features",
-    [
-        Column("accuracy", "high", note="0 to 1"),
-        Column("error", "low", 1),
-        Column("95 %", None, 1, of="accuracy"),
-    ],
-    [
-        Row("geometry_a & b", (0.81234, 2.0, Interval(0.8, 0.9))),
-        Row("pixels | raw", (0.5, 1.0, None), control=True),
-        Row("{odd} $1 #2 ~^\\", (float("nan"), 3.0, "*x*")),
-    ],
-)
+COLUMNS = [Column("accuracy", "high", note="0 to 1"), Column("error", "low", 1)]
+COLUMNS += [Column("95 %", None, 1, of="accuracy")]
+ROWS = [
+    Row("geometry_a & b", (0.81234, 2.0, Interval(0.8, 0.9))),
+    Row("pixels | raw", (0.5, 1.0, None), control=True),
+    Row("{odd} $1 #2 ~^\\", (float("nan"), 3.0, "*x*")),
+]
+TABLE = ScoreTable("Scores_of 50 % | all", "features", COLUMNS, ROWS)
 
 
 def test_markdown_is_the_table():
@@ -97,15 +91,12 @@ def test_latex_is_the_table():
     assert all(re.sub(r"\\&", "", line).count("&") == 3 for line in rows)
 
 
-def test_a_data_frame_holds_the_numbers():
+def test_a_data_frame_holds_the_numbers_and_a_line_says_what_is_missing_for_one(monkeypatch):
     frame = Scores([TABLE], {}).to_pandas()
     assert list(frame.columns) == ["accuracy", "error", "accuracy low", "accuracy high", "control"]
     assert frame.index.name == "features"
     assert frame.loc["geometry_a & b"].tolist() == [0.81234, 2.0, 0.8, 0.9, False]
     assert frame["control"].tolist() == [False, True, False] and frame["accuracy low"].isna().sum() == 2
-
-
-def test_without_pandas_one_line_says_so(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pip install pandas"):
         TABLE.to_pandas()

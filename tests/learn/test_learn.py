@@ -24,9 +24,8 @@ def images() -> ImageSet:
 def run(images, tmp_path_factory):
     out = tmp_path_factory.mktemp("learn") / "run"
     phases = set()
-    result = derender.train(
-        images, out=out, preset="small", settings=TINY, device="cpu", progress=lambda at: phases.add(at.phase)
-    )
+    how = {"device": "cpu", "progress": lambda at: phases.add(at.phase)}
+    result = derender.train(images, out=out, preset="small", settings=TINY, **how)
     assert (result.images, result.stopped) == (16, "images") and phases == {"train", "features"}
     return out
 

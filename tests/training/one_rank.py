@@ -32,9 +32,8 @@ def step(model: Derenderer, images: torch.Tensor, own: float, ranks: Ranks):
     torch.manual_seed(0)
     for parameter in features.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
-    result = training_step(
-        model, ranks.own(images), OBJECTIVE, features, noise, own=own, ranks=ranks, chunks=1 + (own < 1)
-    )
+    how = {"own": own, "ranks": ranks, "chunks": 1 + (own < 1)}
+    result = training_step(model, ranks.own(images), OBJECTIVE, features, noise, **how)
     result.total.backward()
     gradients = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
     if ranks.count > 1:
@@ -55,14 +54,10 @@ def largest_difference(own: float, ranks: Ranks) -> dict[str, float]:
     terms, shared = step(model, images, own, ranks)
     assert whole_terms.keys() == terms.keys()
     assert whole.keys() == shared.keys()
-    return {
-        "terms": max(abs(terms[name] / value - 1) for name, value in whole_terms.items()),
-        "gradients": max(
-            float((shared[name] - value).abs().max() / value.abs().max().clamp(min=1e-12))
-            for name, value in whole.items()
-        ),
-        "loocc": whole_terms["loocc"],
-    }
+    of_terms = max(abs(terms[name] / value - 1) for name, value in whole_terms.items())
+    apart = {name: (shared[name] - value).abs().max() for name, value in whole.items()}
+    gradients = max(float(apart[name] / one.abs().max().clamp(min=1e-12)) for name, one in whole.items())
+    return {"terms": of_terms, "gradients": gradients, "loocc": whole_terms["loocc"]}
 
 
 def main() -> None:

@@ -88,11 +88,8 @@ def test_waiting_is_what_was_not_read_ahead(monkeypatch):
 
 
 def test_streams_differ_by_purpose_and_position_and_repeat():
-    draws = {
-        (purpose, position): torch.rand(4, generator=random_stream(0, purpose, position)).tolist()
-        for purpose in ("order", "flip", "perturb")
-        for position in range(5)
-    }
+    keys = [(purpose, position) for purpose in ("order", "flip", "perturb") for position in range(5)]
+    draws = {key: torch.rand(4, generator=random_stream(0, *key)).tolist() for key in keys}
     assert len({tuple(value) for value in draws.values()}) == len(draws)
     assert torch.rand(4, generator=random_stream(0, "flip", 3)).tolist() == draws["flip", 3]
 

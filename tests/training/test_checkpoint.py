@@ -33,11 +33,9 @@ def changed(tmp_path):
         folder = tmp_path / "last"
         save_checkpoint(folder, net, optimiser, TrainState(images=8))
         kept = load_file(folder / "optimiser.safetensors")
-        kept = {name: moments(name, value) for name, value in kept.items()}
-        save_file(
-            {name: value for name, value in kept.items() if value is not None},
-            folder / "optimiser.safetensors",
-        )
+        moved = {name: moments(name, value) for name, value in kept.items()}
+        moved = {name: value for name, value in moved.items() if value is not None}
+        save_file(moved, folder / "optimiser.safetensors")
         described = json.loads((folder / "state.json").read_text())
         described["state"] |= notes.pop("state", {})
         described["groups"][0] |= notes
@@ -96,16 +94,12 @@ def test_the_first_weight_that_does_not_fit_is_named_and_nothing_is_changed():
     target = normalised()
     before = {name: value.clone() for name, value in target.state_dict().items()}
     given = normalised().state_dict()
+    few = {name: value for name, value in given.items() if name not in ("1.running_var", "2.bias")}
+    shape = r"'0\.weight' has shape \(4, 2\) there and \(3, 2\) in this architecture"
     for weights, message in [
-        (
-            normalised(4).state_dict(),
-            r"'0\.weight' has shape \(4, 2\) there and \(3, 2\) in this architecture",
-        ),
+        (normalised(4).state_dict(), shape),
         ({**given, "stranger": torch.zeros(1)}, "it has 'stranger', which this architecture lacks"),
-        (
-            {name: value for name, value in given.items() if name not in ("1.running_var", "2.bias")},
-            r"it has no '1\.running_var', which this architecture needs",
-        ),
+        (few, r"it has no '1\.running_var', which this architecture needs"),
     ]:
         with pytest.raises(ValueError, match=message):
             fit_weights(target, weights)

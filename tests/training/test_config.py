@@ -18,9 +18,8 @@ def test_every_preset_survives_yaml():
 
 
 def test_overrides_by_full_and_by_short_name():
-    config = resolve(
-        "small", ["optimiser.learning_rate=3e-4", "batch_size=16", "betas=[0.5, 0.99]", "confidence=false"]
-    )
+    changes = ["optimiser.learning_rate=3e-4", "batch_size=16", "betas=[0.5, 0.99]", "confidence=false"]
+    config = resolve("small", changes)
     assert config.optimiser.learning_rate == 3e-4
     assert config.batch_size == 16
     assert config.optimiser.betas == (0.5, 0.99)
@@ -36,10 +35,7 @@ def test_explicit_values_win_and_none_means_not_given():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (
-            ["lerning_rate=1"],
-            "unknown setting 'lerning_rate'.*did you mean 'learning_rate'|optimiser.learning_rate",
-        ),
+        (["lerning_rate=1"], "unknown setting 'lerning_rate'.*did you mean '(optimiser.)?learning_rate'"),
         (["learning_rate"], "write key=value"),
         (["learning_rate=fast"], "'optimiser.learning_rate'.*'fast'"),
         (["learning_rate=-1"], "'optimiser.learning_rate'.*greater than 0"),
@@ -56,12 +52,9 @@ def test_bad_overrides_are_one_clear_sentence(overrides, message):
     assert "\n" not in str(caught.value)
 
 
-def test_an_unknown_preset_names_the_nearest():
+def test_an_unknown_preset_names_the_nearest_and_an_unknown_key_in_a_file_is_refused():
     with pytest.raises(ValueError, match="did you mean 'faces'"):
         resolve("face")
-
-
-def test_an_unknown_key_in_a_file_is_refused():
     tree = yaml.safe_load(to_yaml(PRESETS["small"]))
     with pytest.raises(ValueError, match=r"unknown setting 'objective.flip_wieght'"):
         config_from_tree({**tree, "objective": {**tree["objective"], "flip_wieght": 1}})
@@ -82,10 +75,8 @@ def test_the_papers_preset_begins_and_measures_as_the_paper_does():
     assert (paper.objective.perceptual_rescaled, faces.objective.perceptual_rescaled) == (False, True)
     assert (paper.objective.loocc_joint, faces.objective.loocc_joint) == (True, False)  # Eq. 6
     size = ["image_size=32", "width=4", "light_width=4"]
-    plain, scaled = (
-        DerenderTask(resolve("small", [*size, *more])).build().nets["geometry"].decoder.last.weight
-        for more in ([], ["geometry_start=1"])
-    )
+    tasks = (DerenderTask(resolve("small", [*size, *more])) for more in ([], ["geometry_start=1"]))
+    plain, scaled = (task.build().nets["geometry"].decoder.last.weight for task in tasks)
     torch.testing.assert_close(10 * plain, scaled)
 
 

@@ -17,13 +17,9 @@ FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = distillation.RefiningSettings(
     images=192, batch_size=8, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
 )
-SHORT = distillation.RefineConfig.model_validate(
-    {
-        "refining": LESSONS.model_dump(),
-        "whitening": {"pictures": 16, "views": 2, "directions": 8, "spatial": False},
-        "fitting": {"examples": 16},
-    }
-)
+FEW = {"pictures": 16, "views": 2, "directions": 8, "spatial": False}
+PARTS = {"refining": LESSONS.model_dump(), "whitening": FEW, "fitting": {"examples": 16}}
+SHORT = distillation.RefineConfig.model_validate(PARTS)
 
 
 def changed(**refining) -> distillation.RefineConfig:
@@ -108,9 +104,8 @@ def framed(**refining) -> distillation.RefineConfig:
 def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images):
     pictures = images[:16].float() / 255
     meant = distillation.fit_scenes(model, images[:16], 2, print).scene(model.fitting.maps)
-    shown, scene = distillation.examples(
-        model, pictures, meant, framed(rendered=0), torch.Generator().manual_seed(0)
-    )
+    draw = torch.Generator().manual_seed(0)
+    shown, scene = distillation.examples(model, pictures, meant, framed(rendered=0), draw)
     away = scene.camera[:, 5] - meant.camera[:, 5]
     moved = away.abs() > 1e-6
     assert 3 < moved.sum() < 13
@@ -126,9 +121,8 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
-    learned = distillation.refine(
-        model, images, images, framed(images=480, rendered=0, fit_steps=4), seed=5
-    ).model
+    lessons = framed(images=480, rendered=0, fit_steps=4)
+    learned = distillation.refine(model, images, images, lessons, seed=5).model
     assert learned.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255
@@ -143,21 +137,18 @@ def test_further_factors_are_learnt_too(renderer):
     """From an untrained model, all of whose scenes are far from the fitted ones."""
     images = torch.from_numpy(faces.generate(16, image_size=32, seed=9).images)
     settings = {"whitening": {"pictures": 0}, "fitting": {"examples": 16, "coordinates": 4}}
-    start = Derenderer.from_preset(
-        "small", seed=0, image_size=32, renderer=renderer, width=8, light_width=8
-    ).eval()
-    start = make_features(
-        start.requires_grad_(False), images, SHORT.model_copy(update=FeatureSettings(**settings).__dict__)
-    )
+    sizes = {"image_size": 32, "width": 8, "light_width": 8}
+    start = Derenderer.from_preset("small", seed=0, renderer=renderer, **sizes).eval().requires_grad_(False)
+    how = SHORT.model_copy(update=FeatureSettings(**settings).__dict__)
+    start = make_features(start, images, how)
     refined = distillation.refine(start, images, images, changed(images=400), seed=5)
     extra = {row.parameter for row in start.factors} - {"depth", "albedo", "light", "camera"}
     assert extra and {row.parameter for row in start.factors} == set(refined.gaps)
     assert all(refined.gaps[name]["now"] < 0.9 * refined.gaps[name]["before"] for name in extra)
     assert refined.errors["now"] < refined.errors["before"]
     fitted = distillation.fit_scenes(start, images[:16], 2, print).scene(start.fitting.maps)
-    shown, scene = distillation.examples(
-        start, images[:16].float() / 255, fitted, changed(rendered=0.5), torch.Generator().manual_seed(0)
-    )
+    draw, pictures = torch.Generator().manual_seed(0), images[:16].float() / 255
+    shown, scene = distillation.examples(start, pictures, fitted, changed(rendered=0.5), draw)
     again, seen = start.render(scene[:8]), 0.99
     covered = (again.mask > seen)[:, None].expand_as(again.image)
     torch.testing.assert_close(shown[:8][covered], again.image.clamp(0, 1)[covered], atol=1e-4, rtol=0)

@@ -42,16 +42,9 @@ def two_processes(*arguments: str) -> list[tuple[int, str]]:
         "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "GLOO_SOCKET_IFNAME": "lo",
         "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
     }  # fmt: skip
-    running = [
-        subprocess.Popen(
-            [sys.executable, *arguments],
-            env={**common, "RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for rank in range(2)
-    ]
+    own = [common | {"RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    running = [subprocess.Popen([sys.executable, *arguments], env=one, **pipes) for one in own]
     try:
         said = [process.communicate(timeout=120)[0] for process in running]
     finally:

@@ -131,10 +131,8 @@ def test_a_feature_keeps_its_size(plain, images):
 
 
 def test_what_makes_no_sense_is_named(plain, images):
-    for changes, message in (
-        (("coordinates=256", "steps=1"), "leave none of a feature's 256"),
-        (("steps=-1",), "fitting.steps"),
-    ):
+    none_left = {("coordinates=256", "steps=1"): "leave none of a feature's 256"}
+    for changes, message in {**none_left, ("steps=-1",): "fitting.steps"}.items():
         with pytest.raises(ValueError, match=message):
             make_features(plain, images, with_changes(FeatureSettings(), ("pictures=4", *changes)))
     with pytest.raises(ValueError, match="at least 2 images, got 1"):

@@ -10,7 +10,9 @@ from torch.nn.functional import avg_pool2d
 import derender
 from derender.data import ImageSet
 from derender.networks import NetworkSettings
+from derender.objectives.reconstruction import depth_curvature
 from derender.postprocess import Features
+from derender.scene.enlarge import doubled
 from derender.training import resolve, train
 from derender.training.config import with_changes
 from derender.training.derender_task import DerenderTask
@@ -18,14 +20,8 @@ from derender.training.features import fit_whitening
 
 TINY = ["image_size=32", "width=8", "light_width=4", "code_size=16", "border_share=0.0625"]
 SHORT = ["perceptual_weight=1", "self_features_steps=2", "batch_size=8", "checkpoint_every=16", "keep=last"]
-SHORT += [
-    "validate_every=16",
-    "warmup_images=0",
-    "images=32",
-    "whitening.pictures=8",
-    "examples=4",
-    "final_rate=1",
-]
+SHORT += ["validate_every=16", "warmup_images=0", "images=32", "whitening.pictures=8", "examples=4"]
+SHORT += ["final_rate=1"]
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +95,6 @@ def test_sizes_that_cannot_be_grown_from_and_settings_without_growth():
 
 
 def test_curvature_of_the_same_surface_costs_the_same_after_growth():
-    from derender.objectives.reconstruction import depth_curvature
-    from derender.scene.enlarge import doubled
-
     rows = torch.linspace(-1, 1, 32)
     bowl = 1 + 0.05 * (rows[:, None] ** 2 + rows**2)[None]
     finer = doubled(bowl[:, None], "smooth")[:, 0]

@@ -9,14 +9,8 @@ import torch
 
 from derender import Derenderer
 from derender.evaluation import reconstruction_scores
-from derender.training.held_out_errors import (
-    HeldOutErrors,
-    errors_of,
-    read_errors,
-    reconstruction_errors,
-    store_errors,
-    write_errors,
-)
+from derender.training import held_out_errors as kept
+from derender.training.held_out_errors import HeldOutErrors, errors_of, read_errors, reconstruction_errors
 
 
 class Darker(torch.nn.Module):
@@ -36,12 +30,6 @@ def pixels() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (30, 3, 32, 32), dtype=np.uint8)
 
 
-@pytest.fixture
-def folder(tmp_path):
-    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    return net.save(tmp_path / "model")
-
-
 def test_errors_are_those_of_the_evaluation(pixels):
     found = reconstruction_errors(Darker(), pixels, batch_size=7)
     target = torch.from_numpy(pixels).float() / 255
@@ -59,24 +47,26 @@ def test_an_image_into_which_nothing_is_rendered_counts_as_infinitely_wrong(pixe
 def test_quantiles_survive_the_file(pixels, tmp_path):
     errors, each = errors_of(Darker(), pixels), reconstruction_errors(Darker(), pixels)
     assert errors.quantiles[[0, 50, 100]] == pytest.approx([each.min(), np.median(each), each.max()])
-    write_errors(tmp_path, errors)
+    kept.write_errors(tmp_path, errors)
     again = read_errors(tmp_path)
     assert again is not None and again.pictures == 30
     assert again.quantiles == pytest.approx(errors.quantiles, rel=1e-5)
 
 
-def test_errors_are_stored_with_a_model_and_go_when_it_is_saved_anew(folder, pixels):
-    assert store_errors(folder, torch.from_numpy(pixels[:19])) is None and read_errors(folder) is None
+def test_errors_are_stored_with_a_model_and_go_when_it_is_saved_anew(pixels, tmp_path):
+    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+    folder = net.save(tmp_path / "model")
+    assert kept.store_errors(folder, torch.from_numpy(pixels[:19])) is None and read_errors(folder) is None
     with pytest.raises(ValueError, match="errors need 20 images or more"):
         errors_of(Darker(), pixels[:19])
-    assert store_errors(folder, torch.from_numpy(pixels)) is not None and read_errors(folder) is not None
+    assert kept.store_errors(folder, torch.from_numpy(pixels)) is not None and read_errors(folder) is not None
     Derenderer.from_preset("small", image_size=32, width=4).save(folder, overwrite=True)
     assert read_errors(folder) is None
 
 
 @pytest.mark.parametrize("damage", ["", "{", '{"format": 1}', "backwards", "newer"])
 def test_a_damaged_file_says_how_to_make_it_again(tmp_path, damage):
-    file = write_errors(tmp_path, HeldOutErrors(np.linspace(0, 1, 101), 50))
+    file = kept.write_errors(tmp_path, HeldOutErrors(np.linspace(0, 1, 101), 50))
     values = json.loads(file.read_text())
     changed = {"backwards": {"quantiles": values["quantiles"][::-1]}, "newer": {"format": 2}}
     file.write_text(json.dumps(values | changed[damage]) if damage in changed else damage)

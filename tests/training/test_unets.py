@@ -21,9 +21,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def images():
-    return torch.randint(
-        0, 256, (24, 3, 32, 32), generator=torch.Generator().manual_seed(1), dtype=torch.uint8
-    )
+    draw = torch.Generator().manual_seed(1)
+    return torch.randint(0, 256, (24, 3, 32, 32), generator=draw, dtype=torch.uint8)
 
 
 def said_jointly(model, images) -> torch.Tensor:
@@ -111,9 +110,8 @@ def test_it_learns_what_the_model_says():
     pictures = images.float() / 255
     said = unets.pixel_targets(model, pictures)
     maps = torch.cat([*said.maps.values()], dim=1)
-    ours, none = (
-        unets.masked_error(said_jointly(one.model, images), maps, said.mask) for one in (taught, hardly)
-    )
+    jointly = (said_jointly(one.model, images) for one in (taught, hardly))
+    ours, none = (unets.masked_error(one, maps, said.mask) for one in jointly)
     assert ours < 0.85 * none, "the decoder over both learns it, too"
     theirs, ours, none = (one.encode(pictures)["albedo"] for one in (model, taught.model, hardly.model))
     assert (ours - theirs).square().mean() < 0.97 * (none - theirs).square().mean()

@@ -2,16 +2,8 @@
 
 import numpy as np
 
-from derender.evaluation.disentanglement import (
-    DisentanglementCard,
-    FeatureScores,
-    SwapScores,
-    TrueFactor,
-    correlation_matrix,
-    ground_truth_scores,
-    pearson,
-    similarity,
-)
+from derender.evaluation import disentanglement as scored
+from derender.evaluation.disentanglement import DisentanglementCard, FeatureScores, SwapScores, TrueFactor
 
 NAMES = ("light", "camera")
 MOVED = np.array([[0.9, 0.3], [0.1, 0.7]])
@@ -23,13 +15,14 @@ def card(seeds: int = 2, known: bool = True) -> DisentanglementCard:
     factors = [TrueFactor(f"{name} yaw", numbers[:, k], False, (name,)) for k, name in enumerate(NAMES)]
 
     def scores(of: dict[str, np.ndarray], seed: int, swap: bool) -> FeatureScores:
-        truth = ground_truth_scores(of, factors, dimensions="lasso", seed=seed) if known else None
+        truth = scored.ground_truth_scores(of, factors, dimensions="lasso", seed=seed) if known else None
         test = SwapScores(NAMES, MOVED, MOVED, MOVED[0], MOVED[1], MOVED[0] / 2, 4.0 + seed, 4.0, 80)
-        return FeatureScores(pearson(of), similarity(of, seed=seed), truth, test if swap else None)
+        similarity = scored.similarity(of, seed=seed)
+        return FeatureScores(scored.pearson(of), similarity, truth, test if swap else None)
 
     noise = {name: values[::-1] for name, values in blocks.items()}
     rows = {
         "model": [scores(blocks, seed, True) for seed in range(seeds)],
         "shuffled rows": [scores(noise, seed, False) for seed in range(seeds)],
     }
-    return DisentanglementCard(NAMES, rows, correlation_matrix(blocks), (1, 1), 80)
+    return DisentanglementCard(NAMES, rows, scored.correlation_matrix(blocks), (1, 1), 80)

@@ -26,9 +26,8 @@ def lit_pictures(count: int = 60) -> ImageSet:
 
 def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
     net, pictures, steps = model(), lit_pictures(), []
-    card = disentangle(
-        net, pictures, seeds=(0, 1), swap_images=8, progress=lambda done, total: steps.append((done, total))
-    ).result
+    how = {"seeds": (0, 1), "progress": lambda *at: steps.append(at)}
+    card = disentangle(net, pictures, swap_images=8, **how).result
     assert list(card.rows) == ["model", "untrained encoder", "shuffled rows", "random pixels", "PCA"]
     assert all(len(results) == 2 for results in card.rows.values()) and steps[-1] == (10, 10)
     assert card.features == ("geometry", "albedo", "light", "camera") and card.dimensions == (16,) * 4

@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from derender.evaluation.disentanglement.similarity import (
-    correlation_matrix,
-    held_out,
-    linear_cka,
-    pearson,
-    similarity,
-)
+from derender.evaluation.disentanglement import correlation_matrix, linear_cka, pearson, similarity
+from derender.evaluation.disentanglement.similarity import held_out
 
 
 def features(rows: int = 40, size: int = 6, seed: int = 0) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """The swap test: the identity for a model that reads every factor, all alike for one that mixes them."""
 
-from dataclasses import dataclass
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -10,13 +10,7 @@ from derender.evaluation.disentanglement.swap import diagonal_over_rest, swap_te
 from derender.render import Rendering
 from derender.scene import Scene
 
-
-@dataclass(frozen=True)
-class Named:
-    name: str
-    parameter: str
-
-
+Named = namedtuple("Named", "name parameter")
 FACTORS = tuple(Named(*pair) for pair in (("geometry", "depth"), ("albedo", "albedo"), ("light", "light")))
 
 

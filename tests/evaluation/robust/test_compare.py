@@ -36,9 +36,8 @@ def test_identity_itself_scores_one_and_the_light_itself_chance():
     learned = np.arange(len(who)) < PEOPLE * EACH
     # whoever was learned from stood in a light of his own; then all stand in the same
     light = np.column_stack((np.where(learned, who * 10.0, angle), np.ones(len(who))))
-    found = compare_robustness(
-        {"truth": [truth], "light": [light]}, trial, SEEDS, controls=["light"], resample_count=50
-    )
+    features = {"truth": [truth], "light": [light]}
+    found = compare_robustness(features, trial, SEEDS, controls=["light"], resample_count=50)
     rows = rows_of(found)
     assert rows["truth"].scores["area"].value == 1 and rows["truth"].scores["ordinary"].value == 1
     assert rows["truth"].versus["area"].above and rows["truth"].versus["area"].value == 0.75
@@ -84,17 +83,13 @@ def test_bad_features_are_refused():
 
 def test_what_fades_with_the_angle_has_the_smaller_area():
     trial, who, angle = stack()
-    noise = np.random.default_rng(0).normal(size=(len(who), PEOPLE))[
-        trial.unit
-    ]  # a face fades in its own way
-    faded = {
-        f"{strength}": [np.eye(PEOPLE)[who] + strength * angle[:, None] / 60 * noise]
-        for strength in (0.0, 0.6, 3.0)
-    }
+    noise = np.random.default_rng(0).normal(size=(len(who), PEOPLE))
+    fading = angle[:, None] / 60 * noise[trial.unit]  # a face fades in its own way
+    faded = {f"{strength}": [np.eye(PEOPLE)[who] + strength * fading] for strength in (0.0, 0.6, 3.0)}
     found = compare_robustness(faded, trial, (0,), resample_count=20)
     rows, curve = rows_of(found), found.curves[0]
     areas = [rows[name].scores["area"].value for name in ("0.0", "0.6", "3.0", "majority")]
     assert areas == sorted(areas, reverse=True) and areas[0] == 1 and len(set(areas)) == 4
-    fading = curve.values(rows["3.0"])
-    assert fading == sorted(fading, reverse=True) and fading[0] == 1
-    assert rows["3.0"].scores["area"].value == pytest.approx(float(area_under(LEVELS, np.array(fading))))
+    shares = curve.values(rows["3.0"])
+    assert shares == sorted(shares, reverse=True) and shares[0] == 1
+    assert rows["3.0"].scores["area"].value == pytest.approx(float(area_under(LEVELS, np.array(shares))))

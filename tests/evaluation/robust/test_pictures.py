@@ -13,6 +13,7 @@ from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.robust.sources import Recipe, generated_trial, rendered_trial, true_angle_trial
 from derender.evaluation.robust.trial import checked_levels, chosen_axes
+from derender.render import render_scene
 
 YAW, LIGHT = chosen_axes(["yaw", "light"])
 
@@ -41,8 +42,8 @@ def test_a_generated_trial_is_made_once(tmp_path):
     yaw, light = trial.curves
     assert len(trial.images) == 9 + 6 + 2 * (6 + 12)  # 30 degrees to either side
     assert [len(rows) for rows in (*yaw.points, *light.tested)] == [6, 6, 12, 6, 12]
-    recipe_again, memory = Recipe(people=3, learned=3, tested=2, image_size=16), Memory(tmp_path)
-    again = generated_trial(recipe_again, (YAW, LIGHT), (0, 30), memory=memory)
+    memory = Memory(tmp_path)
+    again = generated_trial(replace(recipe), (YAW, LIGHT), (0, 30), memory=memory)
     assert memory.recalled == 1 and np.array_equal(again.images, trial.images)
     expected = recipe.generate("tested", axis=LIGHT, angle=30.0)
     assert np.array_equal(trial.images[light.tested[1][6:]], expected.images)
@@ -65,8 +66,6 @@ def test_a_rendered_trial_changes_the_angle_alone():
     scenes = []
 
     def renderer(scene, fov_deg):
-        from derender.render import render_scene
-
         scenes.append(scene)
         return render_scene(scene, fov_deg)
 
@@ -79,7 +78,8 @@ def test_a_rendered_trial_changes_the_angle_alone():
     trial = rendered_trial(model, pictures, task, learn, test, (YAW, LIGHT), (0, 40))
     plain, *turned = scenes
     assert len(trial.images) == 8 + 2 * (2 + 4) and trial.curves[0].learn.tolist() == [0, 1, 2, 3, 4, 5]
-    own = own_of(model, images[test])
+    with torch.inference_mode():
+        own = model.decompose(torch.from_numpy(images[test]).float() / 255)
     assert torch.allclose(plain.camera[6:], own.camera, atol=1e-6)
     for at, (column, angle) in enumerate(((1, 0), (1, -40), (1, 40))):
         assert turned[at].camera[:, column].tolist() == pytest.approx([math.radians(angle)] * 2)
@@ -92,11 +92,6 @@ def test_a_rendered_trial_changes_the_angle_alone():
     groups = np.array(["a", "a", "b", "b", "", "", "", "c"])  # the fifth is learned from, the seventh tested
     apart = rendered_trial(model, pictures, task, learn, test, (YAW,), (0, 40), groups=groups)
     assert apart.unit[0] == apart.unit[1] != apart.unit[2] and len(set(apart.unit[:8].tolist())) == 6
-
-
-def own_of(model, images):
-    with torch.inference_mode():
-        return model.decompose(torch.from_numpy(images).float() / 255)
 
 
 def test_true_angles_divide_tracks():
@@ -129,13 +124,10 @@ def test_bad_words_are_refused():
         checked_levels((30, 0), [YAW])
     with pytest.raises(ValueError, match=r"within 0\.\.85 degrees"):
         checked_levels((0, 90), [YAW])
-    with pytest.raises(
-        ValueError, match="unknown label of generated faces 'expresion'; did you mean 'expression'"
-    ):
-        generated_trial(
-            Recipe(label="expresion", people=2, learned=1, tested=1, image_size=16), [YAW], (0, 9)
-        )
+    few = Recipe(people=2, learned=1, tested=1, image_size=16)
+    with pytest.raises(ValueError, match="label of generated faces 'expresion'; did you mean 'expression'"):
+        generated_trial(replace(few, label="expresion"), [YAW], (0, 9))
     with pytest.raises(ValueError, match="fewer than two values of 'identity' have two images"):
-        generated_trial(Recipe(people=2, learned=1, tested=1, image_size=16), [YAW], (0, 9))
+        generated_trial(few, [YAW], (0, 9))
     with pytest.raises(ValueError, match="unknown kind 'face'"):
         Recipe("face")

@@ -11,22 +11,13 @@ from torchmetrics.functional.classification import multiclass_accuracy, multicla
 
 from derender import Derenderer
 from derender.evaluation.memory import Memory
-from derender.evaluation.segmentation import VARIANTS, SegmentSettings, divide, segment
-from derender.evaluation.segmentation.compare import (
-    COLUMNS,
-    best_classes,
-    class_iou,
-    count_pixels,
-    resampled_scores,
-)
-from derender.evaluation.segmentation.data import (
-    by_colour,
-    by_components,
-    most_frequent,
-    most_frequent_at_place,
-)
+from derender.evaluation.segmentation import VARIANTS, SegmentSettings, compare, divide, segment
+from derender.evaluation.segmentation import data as controls
+from derender.evaluation.segmentation.compare import count_pixels, resampled_scores
+from derender.evaluation.segmentation.data import by_colour, by_components, most_frequent
 from derender.evaluation.segmentation.nets import answer, build_variant, chosen_variants, train_segmenter
 
+DOUBLE = np.ones((2, 2), np.uint8)
 QUICK = SegmentSettings(learning_rate=1e-2, epochs=6, batch_size=4)
 
 
@@ -38,7 +29,7 @@ def mean_iou(answers, data) -> float:
 def test_controls_answer_what_they_may_know(data):
     truth = data.masks[data.test]
     assert (most_frequent(data) == np.bincount(data.masks[data.train].ravel()).argmax()).all()
-    place = most_frequent_at_place(data)
+    place = controls.most_frequent_at_place(data)
     column = [np.bincount(data.masks[data.train, row, 7]).argmax() for row in range(32)]
     assert (place == place[0]).all() and (place[0, :, 7] == column).all()
     colours = by_colour(data, seed=0)
@@ -60,11 +51,8 @@ def test_a_net_learns_and_leaves_the_model_alone(name, data, model, before):
     assert losses[-1] < losses[0] and told[-1] == 6 * len(data.train)
     assert mean_iou(answer(net, data.images[data.test]), data) > 0.5
     frozen = build_variant(model, VARIANTS[name], data, seed=0)
-    same = [
-        torch.equal(a, b)
-        for a, b in zip(net.encoders.parameters(), frozen.encoders.parameters(), strict=True)
-    ]
-    assert all(same) == VARIANTS[name].frozen
+    pairs = zip(net.encoders.parameters(), frozen.encoders.parameters(), strict=True)
+    assert all(torch.equal(*pair) for pair in pairs) == VARIANTS[name].frozen
 
 
 def test_where_the_weights_come_from(data, model, before):
@@ -155,13 +143,9 @@ def test_bad_input_is_named(data, model):
     with pytest.raises(ValueError, match=r"no U-Net encoder for geometry.*--set encoder=unet"):
         segment(plain, data, variants=["geometry"])
     without = Derenderer.from_preset("small", seed=0, image_size=32, encoder="unet", unet_width=4)
-    with pytest.raises(
-        ValueError, match="the model has no U-Net decoder: make a copy that has with derender"
-    ):
+    with pytest.raises(ValueError, match="the model has no U-Net decoder: make a copy that has with"):
         segment(without, data, variants=["joint-whole"])
-    large = replace(
-        data, images=np.zeros((40, 3, 64, 64), np.uint8), masks=data.masks.repeat(2, axis=1).repeat(2, axis=2)
-    )
+    large = replace(data, images=np.zeros((40, 3, 64, 64), np.uint8), masks=np.kron(data.masks, DOUBLE))
     with pytest.raises(ValueError, match="the images are 64x64, the model takes 32x32"):
         segment(model, large, variants=["geometry"])
 
@@ -169,7 +153,8 @@ def test_bad_input_is_named(data, model):
 def scores(answers, masks, n_classes=4) -> SimpleNamespace:
     counts = count_pixels(np.asarray(answers), np.asarray(masks), n_classes)
     values = resampled_scores(counts, np.ones((1, len(counts))))[0]
-    return SimpleNamespace(**dict(zip(COLUMNS, values, strict=True)), class_iou=class_iou(counts))
+    named = dict(zip(compare.COLUMNS, values, strict=True))
+    return SimpleNamespace(**named, class_iou=compare.class_iou(counts))
 
 
 def test_a_class_that_no_mask_shows_is_left_out_for_every_answer():
@@ -216,4 +201,4 @@ def test_resamples_are_scores_of_the_pictures_drawn_with_the_same_ten_classes():
     found = scores(answers[drawn], masks[drawn])
     expected = [found.mean_iou, found.mean_iou, found.pixel_accuracy]
     assert resampled_scores(counts, weights)[0] == pytest.approx(expected)
-    assert set(best_classes(counts)) == {0, 1, 2} and len(best_classes(counts, 2)) == 2
+    assert set(compare.best_classes(counts)) == {0, 1, 2} and len(compare.best_classes(counts, 2)) == 2
