@@ -2,12 +2,19 @@
 
 import json
 import re
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import derender.demo as package
+from derender.cli import main
 from derender.data.synthetic import faces
 from derender.demo import DemoSettings, demo_page, run_demo, run_own_demo
 from derender.demo.page import score_tables, shown_rows
@@ -15,36 +22,41 @@ from derender.demo.story import STAGES
 from derender.evaluation import GeometryResult
 
 TINY = DemoSettings(
-    train_pictures=24,
-    test_pictures=16,
-    images=16,
-    minutes=5,
-    fit_steps=2,
-    shown=2,
-    films=1,
-    portrait_px=64,
+    train_pictures=24, test_pictures=16, images=16, minutes=5, fit_steps=2, shown=2, films=1, portrait_px=64,
     overrides=("image_size=32", "width=4", "light_width=4", "batch_size=8", "self_features_steps=1"),
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """A finished demo, and the stages it reported."""
-    stages: list[str] = []
-    result = run_demo(
-        tmp_path_factory.mktemp("demo") / "out", TINY, seed=3, report=lambda stage, *_: stages.append(stage)
-    )
-    return result, list(dict.fromkeys(stages))
+    """What the command's demo gave (``result``), the stages it reported, where it wrote, what it said."""
+    place, stages, said, results = tmp_path_factory.mktemp("demo"), [], StringIO(), []
+
+    def heard(out: Path, settings: DemoSettings, *, report: Callable[..., None], **how):
+        def told(stage: str, *at: object) -> None:
+            stages.append(stage)
+            report(stage, *at)
+
+        results.append(run_demo(place / out, settings, report=told, **how))
+        return results[0]
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        patch.setattr(package, "QUICK", TINY)
+        patch.setattr(package, "run_demo", heard)
+        patch.chdir(place)
+        assert main(["demo", "--quick", "--seed", "3", "--json", "numbers.json"]) == 0
+    stages = list(dict.fromkeys(stages))
+    return SimpleNamespace(result=results[0], stages=stages, place=place, said=said.getvalue())
 
 
 @pytest.fixture(scope="module")
 def html(told) -> str:
-    return demo_page(told[0]).html()
+    return (told.place / "derender-demo" / "report.html").read_text()
 
 
 def test_every_stage_happens_in_order_and_scores_stand_beside_their_controls(told):
-    result, stages = told
-    assert stages == ["editing photographs", *STAGES]
+    result = told.result
+    assert told.stages == ["editing photographs", *STAGES]
     assert set(result.seconds) == set(STAGES)
     assert result.trained.images == 16
     tables = score_tables(result)
@@ -59,7 +71,7 @@ def test_every_stage_happens_in_order_and_scores_stand_beside_their_controls(tol
 
 
 def test_page_shows_every_column_and_number(told, html):
-    result, _ = told
+    result = told.result
     assert f"{100 * result.geometry.model.side:.3f}" in html
     shown = ("reconstruction", "another light", "another view", "true depth", "true albedo", "Gradientfaces")
     assert all(word in html for word in shown)
@@ -69,15 +81,14 @@ def test_page_shows_every_column_and_number(told, html):
 
 
 def test_sentences_follow_the_numbers(told):
-    result, _ = told
+    result = told.result
     geometry = result.geometry
     side, mad = geometry.plane.side_each, np.ones_like(geometry.plane.mad_deg_each)
     better = replace(geometry.model, side_each=side / 100, mad_deg_each=0.1 * mad)
     worse = replace(geometry.model, side_each=100 * side, mad_deg_each=179.0 * mad)
     for scores, said in ((better, "better than every control"), (worse, "behind the strongest control")):
-        changed = replace(
-            result, geometry=GeometryResult(scores, geometry.average_depth, geometry.plane, None)
-        )
+        other = GeometryResult(scores, geometry.average_depth, geometry.plane, None)
+        changed = replace(result, geometry=other)
         tables = score_tables(changed)
         assert all(said in tables["geometry"].verdict(column) for column in (0, 1))
         html = demo_page(changed).html()
@@ -85,17 +96,10 @@ def test_sentences_follow_the_numbers(told):
         assert ("Not ahead of every control: depth" in html) == (scores is worse)
 
 
-def test_command_writes_page_and_numbers(tmp_path, monkeypatch, capsys):
-    import derender.demo as package
-    from derender.cli import main
-
-    monkeypatch.setattr(package, "QUICK", TINY)
-    monkeypatch.chdir(tmp_path)
-    assert main(["demo", "--quick", "--json", "numbers.json"]) == 0
-    out = capsys.readouterr().out
-    assert out.strip().splitlines()[-1] == "report derender-demo/report.html"
-    assert (tmp_path / "derender-demo" / "report.html").stat().st_size > 20_000
-    numbers = json.loads((tmp_path / "numbers.json").read_text())
+def test_command_writes_page_and_numbers(told, html):
+    assert told.said.strip().splitlines()[-1] == "report derender-demo/report.html"
+    assert len(html) > 20_000
+    numbers = json.loads((told.place / "numbers.json").read_text())
     assert numbers["geometry"]["plane"]["MAD"] > 0 and numbers["clustering"]["pixels"]["accuracy"] > 0
 
 
@@ -113,7 +117,7 @@ def test_a_folder_of_ones_own_opens_with_photographs_and_ends_with_its_run(tmp_p
 
 
 def test_the_bundled_model_is_beside_and_named(told, html):
-    result, _ = told
+    result = told.result
     assert "The bundled model" in html
     assert html.count("by rendered-faces-64: the light goes round") == 4
     for column in ("reconstruction", "normals", "albedo", "another view"):
@@ -122,7 +126,7 @@ def test_the_bundled_model_is_beside_and_named(told, html):
 
 
 def test_both_models_are_scored_on_the_same_faces(told):
-    result, _ = told
+    result = told.result
     geometry = result.geometry
     each = np.full_like(geometry.model.side_each, 0.001)
     better = replace(geometry, model=replace(geometry.model, side_each=each))
