@@ -9,13 +9,13 @@ from derender.baselines import controls
 from derender.baselines.model import optional
 from derender.data import ImageSet
 from derender.features import model_fingerprint
+from derender.model import Derenderer
 
 
 def pictures(count: int = 30, size: int = 8, seed: int = 0) -> ImageSet:
     images = np.random.default_rng(seed).integers(0, 256, (count, 3, size, size), dtype=np.uint8)
-    return ImageSet(
-        images, tuple(f"{i}.png" for i in range(count)), {"who": np.arange(count) % 3}, source="made"
-    )
+    files = tuple(f"{i}.png" for i in range(count))
+    return ImageSet(images, files, {"who": np.arange(count) % 3}, source="made")
 
 
 def test_pixels_are_the_pixels():
@@ -38,15 +38,8 @@ def test_pca_takes_its_components_from_other_pictures():
         controls.pca_features(train, components=4, fit_on=pictures(size=4))
 
 
-@pytest.fixture
-def small():
-    from derender.model import Derenderer
-
-    return Derenderer.from_preset("small", seed=5)
-
-
-def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generator(small):
-    state = torch.random.get_rng_state()
+def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generator():
+    small, state = Derenderer.from_preset("small", seed=5), torch.random.get_rng_state()
     first, again, other = (controls.untrained_twin(small, seed) for seed in (0, 0, 1))
     assert torch.equal(torch.random.get_rng_state(), state)
     assert model_fingerprint(first) == model_fingerprint(again) != model_fingerprint(other)

@@ -66,10 +66,7 @@ def test_other_weights_than_a_dinov2_in_one_safetensors_file_are_refused(dinov2,
         (other, "is a vit, expected a dinov2"),
         (deeper, r"of another architecture: it has no 'encoder\.layer\.2"),
         (parts, r"parts has no model\.safetensors: .*Weights in parts"),
-        (
-            "someone/none",
-            "weights someone/none are not in the Hugging Face cache.*'hf download someone/none'",
-        ),
+        ("someone/none", "weights someone/none are not in the Hugging Face cache.*'hf download someone/none"),
     ):
         with pytest.raises(ValueError, match=told):
             Dinov2.open(str(source))

@@ -98,9 +98,8 @@ def test_a_resumed_run_ends_with_the_very_weights_of_an_undisturbed_one(name, ru
     own = [f"generator={runs / 'stylegan2'}"] * (name == "e4e")
     train_baseline(config(name, 16, *own), blobs, tmp_path / "parts")
     train_baseline(config(name, 32, *own), blobs, tmp_path / "parts", resume=True)
-    whole, parts = (
-        load_file(run / "checkpoints" / "last" / WEIGHTS_FILE) for run in (runs / name, tmp_path / "parts")
-    )
+    last = f"checkpoints/last/{WEIGHTS_FILE}"
+    whole, parts = (load_file(run / last) for run in (runs / name, tmp_path / "parts"))
     assert whole.keys() == parts.keys()
     assert all(torch.equal(whole[key], parts[key]) for key in whole)
 

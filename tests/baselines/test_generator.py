@@ -10,9 +10,8 @@ from derender.baselines import generator as gan
 from derender.baselines.stylegan2 import Discriminator
 
 TAPS = torch.tensor(gan.FILTER, dtype=torch.float64)
-SMALL = gan.GeneratorSettings(
-    image_size=16, style_size=12, mapping_layers=3, channel_base=128, channel_max=10
-)
+WIDTHS = {"channel_base": 128, "channel_max": 10}
+SMALL = gan.GeneratorSettings(image_size=16, style_size=12, mapping_layers=3, **WIDTHS)
 
 
 def config_f(size: int) -> gan.GeneratorSettings:
@@ -39,9 +38,8 @@ def test_the_published_sizes(size, parameters, codes, space):
 def test_style_space_is_ordered_as_images_are_made():
     layers = gan.style_layers(config_f(1024))
     assert sum(layer.channels for layer in layers[:4]) == 2_048
-    assert [(layer.colour, layer.resolution) for layer in layers[:5]] == [
-        (False, 4), (True, 4), (False, 4), (False, 8), (True, 8),
-    ]  # fmt: skip
+    assert [layer.colour for layer in layers[:5]] == [False, True, False, False, True]
+    assert [layer.resolution for layer in layers[:5]] == [4, 4, 4, 8, 8]
     assert [layer.code for layer in layers[:8]] == [0, 1, 1, 2, 3, 3, 4, 5] and layers[-1].code == 17
 
 
@@ -51,9 +49,8 @@ def test_w_its_repetition_and_its_styles_give_the_same_image(net, generator):
     assert image.shape == (3, 3, 16, 16)
     assert torch.equal(image, net(w[:, None].expand(-1, SMALL.codes, -1)))
     assert torch.equal(image, net.synthesise(net.styles(net.w_plus(w)), None, seen))
-    assert [tuple(maps.shape) for maps in seen] == [
-        (3, layer.channels, layer.resolution, layer.resolution) for layer in net.layers
-    ]
+    shapes = [(3, layer.channels, layer.resolution, layer.resolution) for layer in net.layers]
+    assert [tuple(maps.shape) for maps in seen] == shapes
     assert torch.equal(seen[0][0], net.constant[0])
     torch.testing.assert_close(image[1:2], net(w[1:2]))
     with pytest.raises(ValueError, match=r"W\+ of 6 x 12, got \(5, 12\)"):

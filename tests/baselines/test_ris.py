@@ -12,9 +12,8 @@ from derender.data import MASK_CLASSES, read_images
 
 PARTS = ("hair", "skin", "nose", "mouth")  # of the planted generator: quarters of the width, left to right
 EACH = 4  # channels that paint a part
-SIZES = GeneratorSettings(
-    image_size=32, style_size=8, mapping_layers=2, channel_base=512, channel_max=EACH * len(PARTS)
-)
+WIDTHS = {"channel_base": 512, "channel_max": EACH * len(PARTS)}
+SIZES = GeneratorSettings(image_size=32, style_size=8, mapping_layers=2, **WIDTHS)
 
 
 def channels_of(part: int) -> slice:
@@ -51,9 +50,8 @@ def catalogue(planted):
     """Four clusters, named by masks of the four quarters."""
     images = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(1))
     parts = torch.eye(4).repeat_interleave(8, dim=1)[None, :, None].expand(8, -1, 32, -1)
-    return ris.build_catalogue(
-        planted, images, parts, PARTS, ris.RisConfig(image_size=32, clusters=4, samples=20)
-    )
+    config = ris.RisConfig(image_size=32, clusters=4, samples=20)
+    return ris.build_catalogue(planted, images, parts, PARTS, config)
 
 
 def test_spherical_kmeans_finds_directions_whatever_their_length(generator):
@@ -95,9 +93,8 @@ def test_scores_are_mean_energy_over_a_part(generator):
 
 def test_the_rules_of_the_matrix_for_the_published_network(generator):
     """8 parts and the pose over 9,088 channels: colours, the first 2,048, threshold."""
-    layers = style_layers(
-        GeneratorSettings(image_size=1024, style_size=512, channel_base=32_768, channel_max=512)
-    )
+    widths = {"channel_base": 32_768, "channel_max": 512}
+    layers = style_layers(GeneratorSettings(image_size=1024, style_size=512, **widths))
     parts = ("background", "skin", "hair", "eyes", "nose", "mouth", "neck", "ears")
     scores = torch.rand(8, 9_088, generator=generator)
     scores[2, :100] = 5

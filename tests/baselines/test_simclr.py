@@ -48,13 +48,10 @@ def test_grey_is_the_luminance_and_hue_turns_red_to_green_and_leaves_grey(images
     luminance = sum(w * images[:, i] for i, w in enumerate(simclr.LUMINANCE))
     torch.testing.assert_close(colourless, luminance[:, None].expand_as(images))
     red, third = torch.tensor([1.0, 0, 0]).view(1, 3, 1, 1), torch.tensor([2 * math.pi / 3])
-    torch.testing.assert_close(
-        simclr.rotate_hue(red, third).flatten(), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0
-    )
-    angle = torch.full((6,), 0.7)
-    torch.testing.assert_close(
-        simclr.rotate_hue(simclr.rotate_hue(images, angle), -angle), images, atol=1e-5, rtol=0
-    )
+    green, angle = simclr.rotate_hue(red, third).flatten(), torch.full((6,), 0.7)
+    torch.testing.assert_close(green, torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
+    back = simclr.rotate_hue(simclr.rotate_hue(images, angle), -angle)
+    torch.testing.assert_close(back, images, atol=1e-5, rtol=0)
     torch.testing.assert_close(simclr.rotate_hue(colourless, angle), colourless, atol=1e-5, rtol=0)
 
 

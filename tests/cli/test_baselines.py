@@ -53,9 +53,8 @@ def test_embed_then_cluster_as_with_our_own(run, faces, tmp_path, capsys):
     assert "pixels" in shown and "PCA (6)" in shown
     assert "untrained" not in shown  # what is not known: an untrained encoder like a VQ-VAE's
     at_once = ["evaluate", "linear", "--model", run, "--data", faces, "--label", "class", "--counts", 4]
-    assert (
-        call(*at_once, "--finetune", "--epochs", 1, "--seeds", 1, "--heads", "linear", "--resamples", 2) == 0
-    )
+    at_once += ["--finetune", "--epochs", 1, "--seeds", 1, "--heads", "linear", "--resamples", 2]
+    assert call(*at_once) == 0
     assert "fine-tuned" in capsys.readouterr().out
 
 
@@ -107,9 +106,8 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "give --model RUN, or --baseline NAME" in refused(*embed)
     for name in ("vqvae", "untrained"):
         assert f"the baseline {name} needs a model" in refused(*embed, "--baseline", name)
-    assert "unknown feature of vqvae 'maps'; did you mean 'map'" in refused(
-        *embed, "--baseline", "vqvae", "--model", run, "--features", "maps"
-    )
+    maps = ("--baseline", "vqvae", "--model", run, "--features", "maps")
+    assert "unknown feature of vqvae 'maps'; did you mean 'map'" in refused(*embed, *maps)
     assert "holds the baseline 'vqvae'" in refused(*embed, "--model", run)
     assert "holds the baseline 'vqvae', asked for ae" in refused(*embed, "--baseline", "ae", "--model", run)
     assert "hf download" in refused(*embed, "--baseline", "dinov2", "--model", "nobody/nothing")
@@ -119,7 +117,6 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "did you mean 'simclr'" in refused(*train, "--model", "simcrl")
     assert "preset is for derender models" in refused(*train, "--model", "ae", "--preset", "small")
     assert "'model.codes'" in refused(*train, "--model", "vqvae", "--set", "code=3")
-    assert f"{run} trained vqvae, not ae" in refused(
-        "train", "--model", "ae", "--data", faces, "--out", run, "--resume"
-    )
+    other = refused("train", "--model", "ae", "--data", faces, "--out", run, "--resume")
+    assert f"{run} trained vqvae, not ae" in other
     assert not out.exists() and not (tmp_path / "run").exists()

@@ -18,6 +18,8 @@ from derender.cli import console, main
 from derender.cli.console import duration
 from derender.report.decomposition import COLUMN_MEANING
 from derender.settings import plain
+from derender.training import derender_task
+from derender.training.process import TrainingInterrupted
 
 COMMANDS = (
     *("demo", "doctor", "train", "embed", "decompose", "compare", "report", "synth faces", "synth cars"),
@@ -41,11 +43,9 @@ def imported_by(*arguments: str | Path, among: tuple[str, ...]) -> tuple[int, st
         f"import sys; from derender.cli import main; code = main({list(map(str, arguments))}); "
         f"print('imported', *sorted(set({among}) & set(sys.modules)), file=sys.stderr); sys.exit(code)"
     )
-    source = str(Path(__file__).resolve().parents[2] / "src")
-    environment = {**os.environ, "PYTHONPATH": source}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
-    )
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2] / "src")}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, env=env, check=False)
     said, _, found = done.stderr.rpartition("imported")
     return done.returncode, done.stdout + said, found.strip()
 
@@ -139,10 +139,8 @@ def test_decompose_writes_panels_factors_and_numbers(trained, faces, tmp_path, r
     assert run("decompose", "-m", trained, first, other, "--out", out) == 0
     folders = sorted(out.iterdir())
     assert [folder.name for folder in folders] == [first.stem, f"{first.stem}-2"]
-    expected = {"panel.png", "scene.json", "scene.npz"} | {
-        f"{name.replace(' ', '_')}.png" for name in COLUMN_MEANING
-    }
-    assert {file.name for file in folders[0].iterdir()} == expected
+    images = {f"{name.replace(' ', '_')}.png" for name in COLUMN_MEANING}
+    assert {file.name for file in folders[0].iterdir()} == {"panel.png", "scene.json", "scene.npz"} | images
     with Image.open(folders[0] / "depth.png") as depth:
         assert depth.size == (32, 32)
     record = json.loads((folders[0] / "scene.json").read_text())
@@ -157,7 +155,7 @@ def test_decompose_writes_panels_factors_and_numbers(trained, faces, tmp_path, r
         assert panel.width > 8 * 160
 
 
-def test_bad_words_on_the_command_line(refused, tmp_path):
+def test_bad_words_and_settings_name_the_nearest(refused, tmp_path):
     train = ("train", "--data", "x", "--out", tmp_path / "r")
     assert "'train'" in refused("trian")
     assert "--out" in refused("train", "--data", "x")
@@ -165,10 +163,6 @@ def test_bad_words_on_the_command_line(refused, tmp_path):
     assert "--features" in refused("evaluate", "cluster", "--label", "identity")
     assert "IMAGES" in refused("evaluate", "cluster", "--label", "identity", "--model", "m")
     assert "choose auto, cpu or cuda" in refused(*train, "--device", "gpu0", *SETTINGS)
-
-
-def test_bad_settings_name_the_nearest(refused, tmp_path):
-    train = ("train", "--data", tmp_path, "--out", tmp_path / "run")
     assert "'faces'" in refused(*train, "--preset", "facs")
     assert "optimiser.learning_rate" in refused(*train, "--set", "learning_rat=3")
     assert "key=value" in refused(*train, "--set", "learning_rate")
@@ -212,11 +206,9 @@ def test_missing_and_damaged_models(trained, faces, refused, tmp_path):
     assert "damaged" in refused(*embed, damaged)
     assert "records no split" in refused(*embed, trained / "model", "--part", "test")
     assert "unknown part" in refused(*embed, trained, "--part", "tst")
-    not_parquet = tmp_path / "x.parquet"
-    not_parquet.write_bytes(b"nothing")
-    assert str(not_parquet) in refused(
-        "evaluate", "cluster", "--features", not_parquet, "--label", "identity"
-    )
+    other = tmp_path / "x.parquet"
+    other.write_bytes(b"nothing")
+    assert str(other) in refused("evaluate", "cluster", "--features", other, "--label", "identity")
     assert "identity" in refused("evaluate", "cluster", "-m", trained, "-d", faces, "--label", "identty")
 
 
@@ -231,9 +223,6 @@ def test_resume_takes_the_stored_settings(trained, faces, tmp_path, capsys):
 
 
 def test_ctrl_c_says_how_to_go_on(faces, tmp_path, monkeypatch, capsys):
-    from derender.training import derender_task
-    from derender.training.process import TrainingInterrupted
-
     def interrupted(*_, **__):
         raise TrainingInterrupted("stopped after 32 images; run the same command with --resume to go on")
 

@@ -45,11 +45,8 @@ def tables(tmp_path_factory) -> dict[str, Path]:
     """Feature tables with yes/no attributes and identities, one that knows them and two that do not."""
     folder, rng = tmp_path_factory.mktemp("tables"), np.random.default_rng(0)
     who = np.arange(ROWS * 3) % 4
-    labels = {
-        "identity": np.array(list("abcd"))[who],
-        "smiles": (who % 2).astype(np.int8),
-        "young": (who // 2).astype(np.int8),
-    }
+    labels = {"identity": np.array(list("abcd"))[who], "smiles": (who % 2).astype(np.int8)}
+    labels |= {"young": (who // 2).astype(np.int8)}
     files = tuple(f"{row}.png" for row in range(len(who)))
 
     def write(name: str, values: np.ndarray) -> Path:
@@ -57,11 +54,8 @@ def tables(tmp_path_factory) -> dict[str, Path]:
         return FeatureTable(files, factors, labels, {"layout": "lfw"}).write(folder / f"{name}.parquet")
 
     noise = rng.normal(size=(2, len(who), 4))
-    return {
-        "good": write("good", np.eye(4)[who] + 0.05 * noise[0]),
-        "noise": write("noise", noise[0]),
-        "noise2": write("noise2", noise[1]),
-    }
+    values = {"good": np.eye(4)[who] + 0.05 * noise[0], "noise": noise[0], "noise2": noise[1]}
+    return {name: write(name, value) for name, value in values.items()}
 
 
 def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys, numbers):
@@ -95,10 +89,7 @@ def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_
     knn, tuned = told["parts"]
     assert list(knn["rows"]) == ["geometry + albedo", "untrained encoder", "PCA (16)", "pixels", "majority"]
     assert knn["rows"]["pixels"]["scores"]["accuracy"]["value"] > 0.5 and told["kind"] == "classes"
-    assert (tuned["head"], list(tuned["rows"])) == (
-        "fine-tuned",
-        ["geometry + albedo", "untrained encoder", "PCA (16)", "pixels", "majority"],
-    )
+    assert (tuned["head"], list(tuned["rows"])) == ("fine-tuned", list(knn["rows"]))
     head = ["evaluate", "linear", "-m", model, "-d", people, "--label", "class", "--counts", "20"]
     head = numbers(*head, "--heads", "linear", "--seeds", "2", "--epochs", "1", *QUICK, tmp_path)[0]
     alone = head["parts"][0]["rows"]
@@ -125,10 +116,9 @@ def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path,
     assert tuned["ours"]["scores"] != frozen["ours"]["scores"]
     assert main([*map(str, words), "--cache", str(tmp_path)]) == 0
     shown = capsys.readouterr()
-    assert "0 results computed" in shown.err and "10 fine-tuned" in shown.out
-    assert "left out, with fewer than 2 rows of one of their answers: bald, rare" in " ".join(
-        shown.err.split()
-    )
+    said = " ".join(shown.err.split())
+    assert "0 results computed" in said and "10 fine-tuned" in shown.out
+    assert "left out, with fewer than 2 rows of one of their answers: bald, rare" in said
     wrong = ("compare", "--table", "identity", "-m", model, "-d", smiling, "--finetune")
     assert "give the linear table, models and images" in refused(*wrong)
 

@@ -23,10 +23,8 @@ def folder(tmp_path_factory) -> Path:
     net.save(made / "broken")
     write(faces.generate(4, 32, 0), made / "faces")
     values = np.random.default_rng(0).normal(size=(ROWS, 6))
-    labels = {
-        "identity": np.array(list("abcd"))[np.arange(ROWS) % 4],
-        "alone": np.array([f"person {row}" for row in range(ROWS)]),
-    }
+    alone = np.array([f"person {row}" for row in range(ROWS)])
+    labels = {"identity": np.array(list("abcd"))[np.arange(ROWS) % 4], "alone": alone}
     names = tuple(f"{row}.png" for row in range(ROWS))
     FeatureTable(names, {"geometry": values, "albedo": values[:, :2]}, labels).write(made / "ours.parquet")
     FeatureTable(names, {"code": values}, labels).write(made / "other.parquet")

@@ -52,13 +52,10 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
     assert "16 images in" in shown.err and "0 results computed, 9 found" in shown.err
     assert json.loads(shown.out)["scores"] == told
     assert run(*words, "--resume", "--force") == 0
-    assert "leave out weight" in refused("finetune", "-d", faces, "--out", out, "--resume", "--weight", 3)
-    assert "continue with derender finetune --resume" in refused(
-        "train", "-d", faces, "--out", out, "--resume"
-    )
-    assert "continue with derender train --resume" in refused(
-        "finetune", "-d", faces, "--out", begun, "--resume"
-    )
+    resume = ("-d", faces, "--resume", "--out")
+    assert "leave out weight" in refused("finetune", *resume, out, "--weight", 3)
+    assert "continue with derender finetune --resume" in refused("train", *resume, out)
+    assert "continue with derender train --resume" in refused("finetune", *resume, begun)
 
 
 def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
@@ -78,10 +75,9 @@ def test_bad_words_are_one_line(begun, faces, tmp_path, refused):
     assert "no yes/no label" in refused(*tune, "--attributes", "--preset", "small", *settings(*TINY))
     assert "give one of them" in refused(*tune, "-m", begun, "--preset", "small", "-l", "expression")
     assert "no label 'expresion'; did you mean 'expression'" in refused(*tune, "-m", begun, "-l", "expresion")
-    assert "leave out settings of model.network" in refused(
-        *tune, "-m", begun, "-l", "expression", *settings("model.network.width=8")
-    )
-    assert "target.weight" in refused(*tune, "-m", begun, "-l", "expression", "--weight", "-1")
+    from_run = (*tune, "-m", begun, "-l", "expression")
+    assert "leave out settings of model.network" in refused(*from_run, *settings("model.network.width=8"))
+    assert "target.weight" in refused(*from_run, "--weight", "-1")
     assert "no run to resume" in refused(*tune, "--resume")
     assert not (tmp_path / "out").exists()
     there = tmp_path / "there"

@@ -42,12 +42,9 @@ def test_identification_by_light_of_one_half(model, folder, numbers, tmp_path):
 
 def test_light_against_the_names(model, folder, numbers):
     found, _ = numbers("evaluate", "light", folder, "-m", model, *QUICK)
-    assert found["pictures"] == 24 and set(found["azimuth"]) == {
-        "model",
-        "untrained model",
-        "constant answer",
-    }
-    assert found["azimuth"]["constant answer"]["scores"]["error"]["value"] == pytest.approx(80 / 3, rel=1e-4)
+    rows = found["azimuth"]
+    assert found["pictures"] == 24 and set(rows) == {"model", "untrained model", "constant answer"}
+    assert rows["constant answer"]["scores"]["error"]["value"] == pytest.approx(80 / 3, rel=1e-4)
 
 
 def test_what_is_wrong_is_named(model, folder, refused, tmp_path):

@@ -200,9 +200,8 @@ def test_the_whole_photograph_is_written_unless_the_frame_is_asked_for(model, ph
 def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
     one, out = photos / "0.png", tmp_path / "out"
     given = ("-m", model, one, "-o", out)
-    assert "unknown factor 'albdo'; did you mean 'albedo'" in refused(
-        "swap", *given, "--from", photos / "1.png", "--factor", "albdo"
-    )
+    swap = ("swap", *given, "--from", photos / "1.png", "--factor")
+    assert "unknown factor 'albdo'; did you mean 'albedo'" in refused(*swap, "albdo")
     assert "none.png does not exist" in refused("relight", *given, "--like", tmp_path / "none.png")
     assert "holds no images" in refused("rotate", "-m", model, tmp_path, "-o", out)
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")

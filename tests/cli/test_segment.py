@@ -98,9 +98,8 @@ def test_bad_input_is_one_line(parts, tmp_path, refused):
     segment = ("evaluate", "segment", "--out", tmp_path / "out", "-m", net)
     assert "no U-Net encoder for albedo" in refused(*segment[:4], "-m", plain, "-d", parts)
     assert "holds no masks" in refused(*segment, "-d", parts / "images")
-    assert "unknown variant 'gemetry'; did you mean 'geometry'" in refused(
-        *segment, "-d", parts, "--variants", "gemetry"
-    )
+    wrong = refused(*segment, "-d", parts, "--variants", "gemetry")
+    assert "unknown variant 'gemetry'; did you mean 'geometry'" in wrong
     one = tmp_path / "one"
     (one / "images").mkdir(parents=True)
     (one / "masks").mkdir()

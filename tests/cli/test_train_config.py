@@ -28,9 +28,8 @@ def settings(capsys):
 
 def test_a_file_says_what_set_says_and_set_comes_after(settings, tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text(
-        "preset: small\nimages: 5000\nobjective: {loocc: light}\nmodel.ranges: {border_depth: 1.08}\n"
-    )
+    text = "preset: small\nimages: 5000\nobjective: {loocc: light}\nmodel.ranges: {border_depth: 1.08}\n"
+    file.write_text(text)
     by_hand = resolve("small", ["images=5000", "border_depth=1.08"], objective__loocc="light")
     assert settings("--config", file) == by_hand.model_dump(mode="json")
     changed = settings("--config", file, "--set", "images=70", "--loocc", "all")

@@ -38,9 +38,8 @@ def outputs_of(name: str) -> dict[str, np.ndarray]:
     found |= {f"scene.{key}": _thinned(value) for key, value in scene.parameters.items()}
     for what, one in (("rendered", scene), ("moved", relit)):
         drawn = model.render(one)
-        found |= {
-            f"{what}.{key}": _thinned(getattr(drawn, key).float()) for key in ("image", "depth", "mask")
-        }
+        maps = {key: getattr(drawn, key).float() for key in ("image", "depth", "mask")}
+        found |= {f"{what}.{key}": _thinned(value) for key, value in maps.items()}
     if model.fitting is not None:
         fitted = model.fit_scenes(images, FIT_STEPS)
         found |= {f"fitted.{key}": _thinned(value) for key, value in fitted.scene.parameters.items()}

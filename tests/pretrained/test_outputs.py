@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-_spec = importlib.util.spec_from_file_location(
-    "record_outputs", Path(__file__).with_name("record_outputs.py")
-)
+_file = Path(__file__).with_name("record_outputs.py")
+_spec = importlib.util.spec_from_file_location("record_outputs", _file)
 assert _spec is not None and _spec.loader is not None
 record = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(record)

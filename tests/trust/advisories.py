@@ -94,17 +94,14 @@ class Looked:
 
 
 def advisory(row: dict[str, Any]) -> Advisory:
-    return Advisory(
-        **{**row, "affected": tuple(SpecifierSet(text, prereleases=True) for text in row["affected"])}
-    )
+    affected = tuple(SpecifierSet(text, prereleases=True) for text in row["affected"])
+    return Advisory(**{**row, "affected": affected})
 
 
 def looked_up(file: Path = LIST) -> tuple[str, dict[str, Looked]]:
     """The day, and what was found by package."""
     tree = yaml.safe_load(file.read_text())
-    rows = [
-        {**row, "advisories": tuple(map(advisory, row.get("advisories", ())))} for row in tree["packages"]
-    ]
+    rows = [{**row, "advisories": (*map(advisory, row.get("advisories", ())),)} for row in tree["packages"]]
     return str(tree["looked_up"]), {row["package"]: Looked(**row) for row in rows}
 
 
@@ -118,12 +115,11 @@ def lower_bounds() -> dict[str, Version]:
     """The lowest versions that pyproject.toml allows of what it names."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     texts = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
-    return {
-        canonicalize_name(wanted.name): max(
-            Version(one.version) for one in wanted.specifier if one.operator in (">=", "==")
-        )
-        for wanted in map(Requirement, texts)
-    }
+    found = {}
+    for wanted in map(Requirement, texts):
+        lowest = [Version(one.version) for one in wanted.specifier if one.operator in (">=", "==")]
+        found[canonicalize_name(wanted.name)] = max(lowest)
+    return found
 
 
 def versions() -> dict[str, dict[str, Version]]:
@@ -139,7 +135,7 @@ def page() -> str:
     day, found = looked_up()
     judged = versions()
     reached = {
-        name: {kind for kind in judged[name] if found[name].reaching(judged[name][kind])} for name in judged
+        name: {kind for kind in kinds if found[name].reaching(kinds[kind])} for name, kinds in judged.items()
     }
     tested = [name for name in judged if "tested" in reached[name]]
     lowest = [name for name in judged if reached[name] and name not in tested]
@@ -152,9 +148,8 @@ def page() -> str:
             version = judged[name].get(kind)
             rows = found[name].advisories if version is None else found[name].reaching(version)
             lines += [one.row(name) for one in rows]
-        return "\n".join(
-            lines + [line for name in names if kind for line in ("", f"{name}: {found[name].answer}")]
-        )
+        lines += [line for name in names if kind for line in ("", f"{name}: {found[name].answer}")]
+        return "\n".join(lines)
 
     lines = [
         f"| {name} | {those.get('tested', '')} | {those.get('lowest', those.get('lowest set', ''))} | "

@@ -70,11 +70,8 @@ class Found:
 
     def tell(self, more: str = "") -> int:
         """Say what came of it; gives the number of findings."""
-        print(
-            f"{self.target.name}: {self.inputs:,} inputs, {self.accepted:,} read, {len(self.findings)} "
-            f"findings, slowest {self.slowest:.2f} s{more}",
-            flush=True,
-        )
+        said = f"{self.target.name}: {self.inputs:,} inputs, {self.accepted:,} read, {len(self.findings)}"
+        print(f"{said} findings, slowest {self.slowest:.2f} s{more}", flush=True)
         for kind, example in self.findings.items():
             print(f"  {kind} ({self.times[kind]}): {example}", flush=True)
         return len(self.findings)
@@ -99,10 +96,8 @@ def fuzz(target: Target, inputs: int, number: int) -> Found:
             found.keep("whole", "is refused", value)
     if target.wholes and not target.made_again and found.feed(target.given(RUBBISH)):
         found.keep("rubbish", "is read", RUBBISH)
-    chosen = settings(
-        max_examples=inputs, deadline=None, database=None, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
+    only = {"phases": [Phase.generate], "suppress_health_check": list(HealthCheck)}
+    chosen = settings(max_examples=inputs, deadline=None, database=None, **only)
 
     def one(value: Any) -> None:
         found.feed(value)

@@ -119,13 +119,9 @@ def broken_pictures(steps: int = 16) -> dict[str, bytes]:
         "no size.png": png_that_says(0, 0),
         "endless text.png": png_with_endless_text(),
     }
-    whole = {
-        "jpg": encoded(smooth(60, (300, 200)), "JPEG", quality=95),
-        "png": encoded(smooth(61, (90, 70))),
-        "bmp": encoded(smooth(62, (30, 20)), "BMP"),
-        "tif": encoded(smooth(63, (60, 40)), "TIFF"),
-        "webp": encoded(smooth(64, (90, 70)), "WEBP"),
-    }
+    jpeg = encoded(smooth(60, (300, 200)), "JPEG", quality=95)
+    whole = {"jpg": jpeg, "png": encoded(smooth(61, (90, 70))), "bmp": encoded(smooth(62, (30, 20)), "BMP")}
+    whole |= {"tif": encoded(smooth(63, (60, 40)), "TIFF"), "webp": encoded(smooth(64, (90, 70)), "WEBP")}
     for kind, content in whole.items():
         for step in range(1, steps):
             found[f"cut {step:02d} of {steps}.{kind}"] = content[: len(content) * step // steps]

@@ -45,26 +45,13 @@ ENDINGS["exception"] = (INJECTED, 2)
 FAILED = ": failed: "
 """Of a job of a plan, which goes on without it: counted as if it had ended the plan."""
 
-PRELOADED = {
-    "derender",
-    "torch",
-    "lightning_fabric",
-    "tensorboard",
-    "matplotlib",
-    "sklearn",
-    "scipy",
-    "numba",
-}
+PRELOADED = {"derender", "torch", "lightning_fabric", "tensorboard"}
+PRELOADED |= {"matplotlib", "sklearn", "scipy", "numba"}
 DISK_MEGABYTES = 400
 
-LEARNS = " ".join(
-    f"--set {one}"
-    for one in (
-        *("image_size=32", "width=8", "light_width=4", "batch_size=8", "checkpoint_every=24"),
-        *("self_features_steps=2", "validate_every=48", "sample_every=48", "images=96", "deterministic=true"),
-        "whitening.pictures=8",
-    )
-)
+LEARNT = ("image_size=32", "width=8", "light_width=4", "batch_size=8", "checkpoint_every=24")
+LEARNT += ("self_features_steps=2", "validate_every=48", "sample_every=48", "images=96", "deterministic=true")
+LEARNS = " ".join(f"--set {one}" for one in (*LEARNT, "whitening.pictures=8"))
 RUN = ("run", "config.yaml", "--resume")
 MADE = "--data DATA --model MODEL --device cpu"
 SCORED = "--resamples 60 --cache OUT/cache --markdown OUT/scores.md"
@@ -75,10 +62,7 @@ PICTURES = "PHOTO PHOTO2 --model MODEL --device cpu --frame none"
 FILM = f"{PICTURES} --size 64 --stills 2 --film gif,mp4 --frames 6"
 COMMANDS = {  # what to write, and what is given beside it once the file or folder named third is there
     "train": (f"train --data DATA --preset small --device cpu {LEARNS} --out", *RUN),
-    "finetune": (
-        f"finetune --data DATA --preset small --device cpu {LEARNS} {LABELS} --out",
-        *RUN,
-    ),
+    "finetune": (f"finetune --data DATA --preset small --device cpu {LEARNS} {LABELS} --out", *RUN),
     "embed": (f"embed {MADE} --batch-size 4 --out", "table.parquet", "", "--force"),
     "identify": (f"evaluate identify {MADE} {SCORED} --label class --force --json", "scores.json", "", ""),
     "explain": (f"explain {MADE} --label class --seeds 2 --sheets 1 --rows 3 --out", "why", "", "--force"),
@@ -285,12 +269,9 @@ class Trial:
 
     def tell(self) -> None:
         by_cause = ", ".join(f"{cause} {count}" for cause, count in sorted(self.kills.items()))
-        print(
-            f"{self.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
-            f"{self.survived} of {self.rounds} runs ended bit-identical to the undisturbed one; "
-            f"{len(self.faults)} faults",
-            flush=True,
-        )
+        said = f"{self.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
+        said += f"{self.survived} of {self.rounds} runs ended bit-identical to the undisturbed one; "
+        print(f"{said}{len(self.faults)} faults", flush=True)
 
     def numbers_told(self) -> dict[str, object]:
         """For ``--json``."""

@@ -91,14 +91,12 @@ def page() -> str:
     base = needed(project["dependencies"])
     extras = needed(text for wanted in project["optional-dependencies"].values() for text in wanted)
     development = needed(text for group in document["dependency-groups"].values() for text in group)
+    only = {name: one for name, one in development.items() if name not in {**base, **extras}}
+    extras = {name: one for name, one in extras.items() if name not in base}
     parts = {
         "Always needed, with what that needs in turn": base,
-        "Needed by an extra (`pip install 'derender[view]'` and others)": {
-            name: one for name, one in extras.items() if name not in base
-        },
-        "For development only": {
-            name: one for name, one in development.items() if name not in {**base, **extras}
-        },
+        "Needed by an extra (`pip install 'derender[view]'` and others)": extras,
+        "For development only": only,
     }
     return PAGE_HEAD + "".join(f"\n## {title}\n\n{table(found)}\n" for title, found in parts.items())
 

@@ -107,13 +107,9 @@ def made_material(place: Path, pictures: int) -> dict[str, str]:
         Image.fromarray(faces[number].picture).resize((160, 160)).save(place / "faces" / f"{number}.png")
     clip = (draw.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(4))
     write_video(place / "clip.mp4", clip, (64, 48), 10.0)
-    photos = {
-        "FACES": str(place / "faces"),
-        "CLIP": str(place / "clip.mp4"),
-        "PHOTO2": str(place / "photo1.png"),
-        "PHOTO": str(place / "photo0.png"),
-    }
-    return {"DATA": str(data), **photos, "ONE": str(place / "one.parquet"), "TWO": str(place / "two.parquet")}
+    names = {"DATA": "data", "FACES": "faces", "CLIP": "clip.mp4", "PHOTO2": "photo1.png"}
+    names |= {"PHOTO": "photo0.png", "ONE": "one.parquet", "TWO": "two.parquet"}
+    return {word: str(place / name) for word, name in names.items()}
 
 
 def made_runs(place: Path, data: str, model: str) -> dict[str, str]:

@@ -77,10 +77,8 @@ def visit(url: str, image: bytes, done: Counter[str]) -> None:
     for yaw in range(-60, 61, 20):
         light = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0, "yaw_deg": yaw}
         camera = {"rotation_deg": [0, 0, 0], "translation": [0, 0, 0]}
-        ask(
-            "/api/view",
-            json.dumps({"picture": picture, "swaps": {}, "light": light, "camera": camera}).encode(),
-        )
+        view = {"picture": picture, "swaps": {}, "light": light, "camera": camera}
+        ask("/api/view", json.dumps(view).encode())
         done["views"] += 1
     line.close()
 

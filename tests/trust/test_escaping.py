@@ -25,12 +25,8 @@ from derender.report.run import run_page
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run
 
-EVIL = [
-    "<script>alert(1)</script>",
-    "</script><img src=x onerror=alert(2)>",
-    '" onload="alert(3)',
-    "$\\frac$ & ]]>",
-]
+EVIL = ["<script>alert(1)</script>", "</script><img src=x onerror=alert(2)>", '" onload="alert(3)']
+EVIL.append("$\\frac$ & ]]>")
 
 
 def harmless(page: Page, evil: str) -> None:

@@ -65,18 +65,16 @@ def test_exif_turns_an_image_and_an_animation_gives_its_first_frame(hostile):
     turned = read_image(hostile.folder / "rotated.jpg", 16, fit="stretch").astype(int)
     straight = read_image(encoded(smooth(20), "JPEG"), 16, fit="stretch").astype(int)
     assert np.abs(turned - np.rot90(straight, -1, (1, 2))).mean() < 3 < np.abs(turned - straight).mean()
-    assert np.array_equal(
-        read_image(hostile.folder / "animated.png", 16), read_image(encoded(smooth(16)), 16)
-    )
+    first = read_image(hostile.folder / "animated.png", 16)
+    assert np.array_equal(first, read_image(encoded(smooth(16)), 16))
 
 
 def test_commands_count_broken_files_and_name_them(hostile, model, tmp_path, capsys):
     told = tmp_path / "told.json"
     every = [str(hostile.folder), "--dataset", "folder", "--json", str(told)]
     assert main(["doctor", *every]) == 0
-    assert sorted(row["file"] for row in json.loads(told.read_text())["unreadable"]) == sorted(
-        hostile.unreadable
-    )
+    unreadable = json.loads(told.read_text())["unreadable"]
+    assert sorted(row["file"] for row in unreadable) == sorted(hostile.unreadable)
     out = ["--model", model, "--device", "cpu", "--out"]
     assert "Traceback" not in capsys.readouterr().err
     assert main(["embed", *every, *out, str(tmp_path / "F.parquet")]) == 0

@@ -133,9 +133,7 @@ def test_a_damaged_last_checkpoint_falls_back_to_the_one_before_and_says_so(net,
         images, note = net.resumed(run)
     assert images == 8 and note is not None
     DAMAGES[damage](run / "previous" / file)
-    with pytest.raises(
-        DamagedCheckpoint, match=r"previous is damaged .* to begin this run again with --resume"
-    ):
+    with pytest.raises(DamagedCheckpoint, match=r"previous is damaged .* begin this run again with --resume"):
         net.resumed(run)
 
 
@@ -194,15 +192,10 @@ def test_a_seal_names_what_has_changed(tmp_path, content, message):
 def test_a_killed_embedding_is_resumed_to_the_same_table(tmp_path):
     """Three real kills; the script makes as many as it is told, and kills training and comparing too."""
     model = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    told = ["--what", "embed", "--kills", "3", "--seed", "1", "--no-mount", "--pictures", "24"]
-    told += ["--model", str(model.save(tmp_path / "model"))]
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "tests" / "trust" / "kills.py"), *told],
-        capture_output=True,
-        text=True,
-        timeout=280,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )
+    told = ["--what", "embed", "--kills", "3", "--seed", "1", "--no-mount", "--pictures", "24", "--model"]
+    told = [sys.executable, ROOT / "tests" / "trust" / "kills.py", *told, model.save(tmp_path / "model")]
+    place = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run(told, capture_output=True, text=True, timeout=280, env=place)
     assert done.returncode == 0, done.stdout + done.stderr
     last = done.stdout.strip().splitlines()[-1]
     assert last.startswith("embed: 3 kills") and last.endswith(" 0 faults")

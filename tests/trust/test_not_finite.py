@@ -132,9 +132,7 @@ def test_each_stage_is_named(model, images, stage, bad):
 @pytest.mark.parametrize("bad", [nan, inf])
 def test_perceptual_features(model, images, bad):
     features = SelfFeatures((4, 4, 4))
-    features.register_forward_hook(
-        lambda _, __, output: torch.full_like(output, bad) if output.requires_grad else output
-    )
+    features.register_forward_hook(lambda _, __, out: torch.full_like(out, bad) if out.requires_grad else out)
     assert "is the loss term 'perceptual'" in what_is_said(model, images, features)
 
 
@@ -196,9 +194,8 @@ def test_a_gradient_that_is_no_number_ends_a_run_before_it_is_used(tmp_path, mon
 
     def spoiler(model: Derenderer) -> None:
         trained.append(model)
-        model.nets["light"].decoder.register_full_backward_hook(
-            lambda _, inputs, __: tuple(torch.full_like(one, nan) for one in inputs)
-        )
+        decoder = model.nets["light"].decoder
+        decoder.register_full_backward_hook(lambda _, ins, __: tuple(torch.full_like(x, nan) for x in ins))
 
     (finding,) = run_of(spoiler, tmp_path / "run", monkeypatch, f"watch={watch}")
     assert finding.fatal and "the gradient of nets.light.encoder" in finding.text

@@ -71,9 +71,7 @@ def cheaply():
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(
-        resource.RLIMIT_AS, (used + (2 << 30), hard)
-    )  # what reads all of it fails, not the machine
+    resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), hard))  # reading it all fails, no machine does
     try:
         yield
     finally:

@@ -28,18 +28,12 @@ def mutated(wholes: list[bytes], number: int) -> bytes:
         at, run, size = draw.randrange(len(content)), draw.randrange(1, 64), draw.choice((2, 4, 8))
         all_bits = (1 << 8 * size) - 1
         value = draw.choice((0, 1, all_bits, all_bits // 2, all_bits // 2 + 1))
-        length, new = draw.choice(
-            (
-                (1, bytes([content[at] ^ 1 << draw.randrange(8)])),
-                (1, draw.randbytes(1)),
-                (4, draw.randbytes(4)),
-                (len(content), b""),
-                (run, b""),
-                (0, bytes(content[at : at + run])),
-                (size, value.to_bytes(size, draw.choice(("little", "big")))),
-                (16, bytes(len(content[at : at + 16]))),
-            )
-        )
+        changes = [(1, bytes([content[at] ^ 1 << draw.randrange(8)])), (1, draw.randbytes(1))]
+        changes += [(4, draw.randbytes(4)), (len(content), b""), (run, b"")]
+        changes.append((0, bytes(content[at : at + run])))
+        changes.append((size, value.to_bytes(size, draw.choice(("little", "big")))))
+        changes.append((16, bytes(len(content[at : at + 16]))))
+        length, new = draw.choice(changes)
         content[at : at + length] = new
     return bytes(content)
 

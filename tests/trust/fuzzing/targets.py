@@ -161,9 +161,8 @@ def checkpoint_target(place: Path) -> Target:
         name = names[content[0] % len(names)] if content else names[0]
         return name, content[1:], name == CHECKSUMS
 
-    change = st.sampled_from(names).flatmap(
-        lambda name: st.tuples(st.just(name), bytes_like(files[name]), st.booleans())
-    )
+    changes = {name: st.tuples(st.just(name), bytes_like(files[name]), st.booleans()) for name in names}
+    change = st.sampled_from(names).flatmap(changes.__getitem__)
     wholes = [bytes([number]) + files[name] for number, name in enumerate(names)]
     return Target("checkpoint", 0.04, change, read, wholes, of_bytes)
 

@@ -86,9 +86,8 @@ def main() -> None:
     folder.mkdir()
     model = Derenderer.seeded(SETTINGS, 0).eval()
     settings = WhiteningSettings(pictures=12, views=2, directions=4)
-    fit_whitening(model, pictures(12), settings, PerturbSettings()).save(
-        model.save(folder / "model") / WHITENING_FILE
-    )
+    whitening = fit_whitening(model, pictures(12), settings, PerturbSettings())
+    whitening.save(model.save(folder / "model") / WHITENING_FILE)
     table().write(folder / "table.parquet")
     torch.manual_seed(0)
     net, optimiser = learner()
