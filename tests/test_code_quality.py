@@ -9,9 +9,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def complaints(*command: str) -> str:
     """What a tool has to say about the checkout; empty when it is content."""
-    done = subprocess.run(
-        [sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, timeout=250
-    )
+    words = [sys.executable, "-m", *command]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=250)
     return "" if done.returncode == 0 else f"{done.stdout}{done.stderr}"
 
 

@@ -245,18 +245,7 @@ def measured(text: str) -> str:
 def test_the_site_builds_without_a_warning(tmp_path):
     for name in ("sphinx", "myst_parser", "furo"):
         pytest.importorskip(name, reason="the site needs the dependency group docs: pip install --group docs")
-    words = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-W",
-        "--keep-going",
-        "-q",
-        "-b",
-        "html",
-        str(DOCS),
-        str(tmp_path),
-    ]
+    words = [sys.executable, *("-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"), DOCS, tmp_path]
     done = subprocess.run(words, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "derender evaluate cluster" in (tmp_path / "reference" / "commands.html").read_text()

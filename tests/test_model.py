@@ -203,13 +203,10 @@ class Shine:
 
 
 HIGHLIGHT = Factor(
-    name="highlight",
-    parameter="highlight",
-    build=vector_net(1),
+    name="highlight", parameter="highlight", build=vector_net(1), mirrored=False,
     to_parameter=lambda raw, ranges: raw.float() / 2 + 0.5,
-    mirrored=False,
     perturb=lambda value, generator, settings, ranges: torch.rand(value.shape, generator=generator),
-)
+)  # fmt: skip
 
 
 def test_a_fifth_factor_trains_embeds_and_is_perturbed_without_touching_anything_else(images, tmp_path):

@@ -154,14 +154,9 @@ def test_a_length_beside_chunks_is_refused_and_nothing_behind_it_is_served(clien
 @pytest.mark.parametrize(
     "more",
     [
-        "Content-Length: 2\r\nContent-Length: 30\r\n",
-        "Content-Length: -1\r\n",
-        "Content-Length: 2x\r\n",
+        *("Content-Length: 2\r\nContent-Length: 30\r\n", "Content-Length: -1\r\n", "Content-Length: 2x\r\n"),
         "Content-Length: 5\r\nTransfer-Encoding: chunked\r\nTransfer-Encoding: identity\r\n",
-        "Host: evil.example\r\n",
-        "X-Long: " + "a" * 100_000 + "\r\n",
-        "Broken\r\n",
-        "X: a\0b\r\n",
+        *("Host: evil.example\r\n", "X-Long: " + "a" * 100_000 + "\r\n", "Broken\r\n", "X: a\0b\r\n"),
     ],
 )
 def test_heads_that_say_two_things_are_refused(client, more):
