@@ -7,9 +7,8 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
 LONGEST = ("test_pyright_finds_nothing", "test_readers_refuse_what_is_broken", "test_two_processes")
+LONGEST += ("test_what_fails_in_all_processes",)  # with the two processes of those before
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

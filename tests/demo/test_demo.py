@@ -23,7 +23,8 @@ from derender.evaluation import GeometryResult
 
 TINY = DemoSettings(
     train_pictures=24, test_pictures=16, images=16, minutes=5, fit_steps=2, shown=2, films=1, portrait_px=64,
-    overrides=("image_size=32", "width=4", "light_width=4", "batch_size=8", "self_features_steps=1"),
+    overrides=("image_size=32", "width=4", "light_width=4", "batch_size=8",
+               "objective.self_features_steps=1"),
 )  # fmt: skip
 
 
