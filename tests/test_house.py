@@ -17,7 +17,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (7_850, 34),  # the generated benchmark
-    "evaluation": (8_210, 39),
+    "evaluation": (8_220, 39),  # public functions name their errors
     "report": (4_550, 27),
     "cli": (2_510, 35),  # names of bundled models stand in help by themselves
     "training": (3_460, 16),  # highlights learn at a rate of their own
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (680, 8),
     "learn": (1_230, 6),
 }
-TOTAL = (41_820, 260)  # the generated benchmark; on the way to (37_000, 270)
+TOTAL = (41_860, 260)  # public functions name their errors; on the way to (37_000, 270)
 TEST_LINES = 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

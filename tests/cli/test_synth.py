@@ -78,6 +78,8 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
         ("faces", ["--tracks", "2", "--count", "5"], "--count does not go with --tracks"),
         ("faces", ["--model", "nowhere.npz"], "nowhere.npz does not exist: expected a morphable model"),
         ("faces", ["--benchmark", "--count", "5"], "--benchmark has settings of its own"),
+        ("faces", ["--benchmark", "--identities", "5"], "--benchmark has settings of its own"),
+        ("cars", ["--benchmark", "--classes", "jeep"], "--benchmark has settings of its own"),
         ("cars", ["--classes", "tank"], "classes must be one or more of sedan"),
         ("cars", ["--view", "side"], "view must be one of usual, wide, frontal"),
         ("cars", ["--set", "view.azimuth_deg=[50,10]"], "view.azimuth_deg"),
@@ -86,8 +88,8 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
 )
 def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, kind, arguments, message):
     assert run("synth", kind, "--out", folder / "bad", *arguments) == 2
-    said = capsys.readouterr().err.strip()
-    assert message in said and len(said.splitlines()) == 1
+    printed = capsys.readouterr().err.strip()
+    assert message in printed and len(printed.splitlines()) == 1
     assert not (folder / "bad").exists()
 
 

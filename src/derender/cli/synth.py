@@ -17,7 +17,8 @@ def generate(
 
     size, file = request.image_size, request.json_file
     if request.benchmark:
-        if GeneratedOptions(request.out, image_size=size, benchmark=True, json_file=file) != request:
+        alone = GeneratedOptions(request.out, image_size=size, benchmark=True, json_file=file)
+        if request != alone or names or model or own:
             raise ValueError("--benchmark has settings of its own: only --image-size goes with it")
         with progress_bar("generating") as report:
             synthetic.write_benchmark(kind, request.out, size, report)
@@ -49,8 +50,8 @@ def faces(
         raise ValueError("--count does not go with --tracks: say --identities, --tracks and --frames")
     count = (identities or 12) * tracks * frames or request.count or 1000
     names = [f"expressions=[{expressions}]"] if expressions else []
-    each = -(-count // identities) if identities and not tracks else 8
-    own = {"tracks": tracks, "frames": frames, "pictures_per_identity": each}
+    own = {"tracks": tracks, "frames": frames} if tracks else {}
+    own |= {"pictures_per_identity": -(-count // identities)} if identities and not tracks else {}
     generate(request, "faces", count, "identities", names, model, **own)
 
 

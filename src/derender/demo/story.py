@@ -202,6 +202,10 @@ def run_demo(
     """Generate, train, score; the training's run folder is ``out/run``.
 
     ``opened`` is called with ``out/report.html`` once that shows photographs, before anything is trained.
+
+    Raises:
+        FileExistsError: ``out`` is not empty.
+        ValueError: training collapsed before it saved a model.
     """
     out = Path(out)
     live = _open(out, None, settings, report, opened)

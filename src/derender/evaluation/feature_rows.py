@@ -146,7 +146,11 @@ def cached_table(
 def chosen_labels(
     table: FeatureTable, label: str | Sequence[str] | None, attributes: bool, least: int = 1
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Label columns by name, or every yes/no column that has ``least`` rows of either answer; and notes."""
+    """Label columns by name, or every yes/no column that has ``least`` rows of either answer; and notes.
+
+    Raises:
+        ValueError: neither or both were given, or no such label exists.
+    """
     if bool(label) == attributes:
         raise ValueError("give either label, a name or several, or attributes")
     if not attributes:

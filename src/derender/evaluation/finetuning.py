@@ -103,7 +103,12 @@ class FinetunedModel(nn.Module):
 
 
 def load_finetuned(source: str | Path, *, device: str | torch.device = "cpu") -> FinetunedModel:
-    """A run folder of `derender finetune`, or its ``model``, ready to predict."""
+    """A run folder of `derender finetune`, or its ``model``, ready to predict.
+
+    Raises:
+        FileNotFoundError: there is no model, or none with a head.
+        ValueError: it is damaged.
+    """
     model, folder = load(source, device=device), Path(source)
     folder = folder if (folder / HEAD_FILE).is_file() else folder / "model"
     if not (folder / HEAD_FILE).is_file():
@@ -129,7 +134,11 @@ class JointLabels:
 
 
 def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
-    """The labels that a configuration names, from an image set; too few images with one are a ValueError."""
+    """The labels that a configuration names, from an image set.
+
+    Raises:
+        ValueError: no label, unknown ones, one class, or fewer labelled images than requested.
+    """
     target = config.target
     if not target.labels:
         known = ", ".join(images.labels) or "no labels"
@@ -304,7 +313,11 @@ def score_finetuned(
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> FinetuneScores:
-    """Score a trained model on the task's test part; what took long is kept in ``memory``."""
+    """Score a trained model on the task's test part; what took long is kept in ``memory``.
+
+    Raises:
+        ValueError: no tested image has a label.
+    """
     target, seed, kept = task.target, task.config.seed, memory or Memory()
     test = target.split.test[target.asked.known[target.split.test]]
     train = target.split.train[(target.visible[target.split.train] >= 0).any(axis=1)]

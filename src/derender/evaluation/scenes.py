@@ -161,9 +161,12 @@ class CopyCost:
 def copy_cost(
     model: Derenderer, other: Derenderer, images: np.ndarray, *, progress: Progress | None = None
 ) -> CopyCost:
-    """Compare a copy of a model, ``other``, with it on uint8 images (N, 3, H, W), two or more.
+    """Compare a copy of a model, ``other``, with it on uint8 images (N, 3, H, W).
 
     ``progress`` is called with (features made, features to make), two of each image.
+
+    Raises:
+        ValueError: fewer than two images, or other factors.
     """
     if len(images) < 2:
         raise ValueError(f"two images or more are needed to compare models, got {len(images)}")

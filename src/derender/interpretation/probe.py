@@ -198,7 +198,12 @@ class _ProbeFile(Settings):
 
 
 def load_probe(folder: str | Path) -> Probe:
-    """What ``Probe.save`` wrote; a file that is damaged or of a newer version is a ValueError."""
+    """What ``Probe.save`` wrote.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged, or of a newer version.
+    """
     folder = Path(folder)
     if not (folder / CONFIG_FILE).is_file() or not (folder / WEIGHTS_FILE).is_file():
         raise FileNotFoundError(

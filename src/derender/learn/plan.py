@@ -122,7 +122,12 @@ class Plan(Settings):
 
 
 def read_plan(path: str | Path) -> Plan:
-    """The plan in a YAML or TOML file; what does not fit is a ValueError that says where and what to do."""
+    """The plan in a YAML or TOML file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it cannot be read, or something in it does not fit; says where and what to do.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no plan at {path}: give --plan the name of a YAML or TOML file")

@@ -47,7 +47,11 @@ Notes = Mapping[Job, Note]
 
 
 def write_outcome(at: Comparison, notes: Notes) -> Scores:
-    """Write every protocol's files beside the plan; gives the one table of each, and what ``--json`` says."""
+    """Write every protocol's files beside the plan; gives the one table of each, and what ``--json`` says.
+
+    Raises:
+        ValueError: nothing at all could be scored.
+    """
     plan, methods, summaries, files = at.plan, at.plan.rows(), [], []
     reasons: dict[str, list[str]] = {"failed": [], "missing": []}
     for job, note in notes.items():

@@ -127,6 +127,10 @@ def write_images(
         resume: leave out images whose folders are there already.
         video: what is done to videos; None refuses them.
         progress: called with (images done, images in all), and what is being done as ``description``.
+
+    Raises:
+        FileExistsError: something would be replaced, and ``force`` is off.
+        ValueError: no image can be read, or the edit is impossible.
     """
     files = image_files(paths)
     if not files:

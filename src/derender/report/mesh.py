@@ -153,6 +153,9 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
         border_columns: pixel columns at each side that the model holds at one depth; they are left out.
         grazing_deg: cells whose surface is turned further from the viewer are left out, except those that the
             rest of the surface encloses.
+
+    Raises:
+        ValueError: there are several scenes, or nothing of the surface is left.
     """
     if not 0 < grazing_deg <= 90:
         raise ValueError(f"grazing must lie above 0 and up to 90 degrees, got {grazing_deg:g}")

@@ -27,6 +27,9 @@ def search_sheet(
 
     ``images`` is the address of the table's images, by default the one that the table records. ``dataset`` is
     their layout, or "auto". ``progress`` is called with (images read, all).
+
+    Raises:
+        ValueError: the address is not known, or holds none of the images.
     """
     address = images if images is not None else str(found.table.origin.get("data", ""))
     if not address:

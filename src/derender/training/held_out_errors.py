@@ -94,8 +94,12 @@ def percentile_of(errors: Float[np.ndarray, " n"], held_out: HeldOutErrors) -> F
 def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     """What images that a model reconstructs badly have in common: their number, and the model that fits.
 
-    One line of (N, 3, S, S) images and the percentiles of their errors among the model's held-out ones. It is
-    empty where no more images are out-of-distribution than among those.
+    Args:
+        images: (N, 3, S, S) all of them.
+        percentiles: of the N errors among the model's held-out ones.
+
+    Returns:
+        One line; empty where no more images are out-of-distribution than among held-out ones.
     """
     odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
     if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):

@@ -48,6 +48,7 @@ def write_generated(
 
     Args:
         truth: write depth, normals, albedo, masks and parts beside the images.
+        progress: called with (images done, ``count``); one that is drawn is half done, until it is written.
         model: file of a morphable model of faces to use; None: the built-in one.
 
     Raises:
@@ -56,8 +57,9 @@ def write_generated(
     """
     require_empty(Path(folder))
     more = {} if model is None else {"model": model}
-    made = KINDS[kind][0](count, image_size, seed, settings, progress, **more)
-    write(made, folder, truth)
+    report = progress or (lambda *_: None)
+    made = KINDS[kind][0](count, image_size, seed, settings, lambda done, _: report(done // 2, count), **more)
+    write(made, folder, truth, lambda done, _: report((count + done) // 2, count))
     return made
 
 

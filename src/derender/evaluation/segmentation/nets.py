@@ -79,7 +79,11 @@ class SegmentSettings(Settings):
 
 
 def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str, Variant]:
-    """Variants by name, or all that the model allows: a U-Net decoder is needed by some."""
+    """Variants by name, or all that the model allows: a U-Net decoder is needed by some.
+
+    Raises:
+        ValueError: an unknown name (with a suggestion), or the model lacks an encoder or decoder.
+    """
     own_decoder = getattr(model, "unet_decoder", None) is not None
     if names is None:
         names = [name for name, variant in VARIANTS.items() if own_decoder or not variant.decoder]

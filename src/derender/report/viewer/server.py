@@ -27,7 +27,11 @@ HEAD_LIMIT_BYTES = 16_384
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 takes any free one. One that cannot be had is a ValueError."""
+    """A listening socket; port 0 takes any free one.
+
+    Raises:
+        ValueError: the port is in use or not allowed, or the address is not one of this machine.
+    """
     if not 0 <= port <= 65535:
         raise ValueError(f"port must lie in 0..65535, got {port}: 0 takes any free one")
     try:
