@@ -21,8 +21,8 @@ def test_the_quick_bench_reports_every_pair_with_the_machine(tmp_path, capsys):
     assert version == torch.__version__.partition("+")[0] and build in torch.__version__
     waiting = found["waiting"]
     assert 0 < waiting["share"] < 1 and 0 < waiting["share_unaided"] < 1 and waiting["seconds"] > 0
-    said = capsys.readouterr().out
-    assert "Ward clustering" in said and "spent waiting for data" in said
+    printed = capsys.readouterr().out
+    assert "Ward clustering" in printed and "spent waiting for data" in printed
 
 
 def test_the_same_work_in_half_the_time_is_a_ratio_of_two():

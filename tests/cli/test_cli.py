@@ -46,8 +46,8 @@ def imported_by(*arguments: str | Path, among: tuple[str, ...]) -> tuple[int, st
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2] / "src")}
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, capture_output=True, text=True, env=env, check=False)
-    said, _, found = done.stderr.rpartition("imported")
-    return done.returncode, done.stdout + said, found.strip()
+    printed, _, found = done.stderr.rpartition("imported")
+    return done.returncode, done.stdout + printed, found.strip()
 
 
 HEAVY = ("torch", "numpy", "numba", "matplotlib", "PIL", "sklearn", "scipy", "pyarrow")
@@ -65,16 +65,18 @@ HEAVY = ("torch", "numpy", "numba", "matplotlib", "PIL", "sklearn", "scipy", "py
     ],
 )  # fmt: skip
 def test_bad_arguments_are_refused_before_anything_heavy_is_imported(arguments, reason):
-    code, said, found = imported_by(*arguments, among=HEAVY)
-    assert (code, found) == (2, "") and reason in said
+    code, printed, found = imported_by(*arguments, among=HEAVY)
+    assert (code, found) == (2, "") and reason in printed
 
 
 def test_one_image_is_decomposed_without_slow_packages(tmp_path):
     file = tmp_path / "a.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(file)
     slow = ("numba", "matplotlib", "sklearn", "scipy", "pyarrow", "torch._dynamo", "tensorboard")
-    code, said, found = imported_by("decompose", file, "-m", "faces-64", "-o", tmp_path / "out", among=slow)
-    assert (code, found) == (0, ""), said
+    code, printed, found = imported_by(
+        "decompose", file, "-m", "faces-64", "-o", tmp_path / "out", among=slow
+    )
+    assert (code, found) == (0, ""), printed
 
 
 def test_version_and_help_need_no_heavy_import():

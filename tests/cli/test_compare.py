@@ -116,9 +116,9 @@ def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path,
     assert tuned["ours"]["scores"] != frozen["ours"]["scores"]
     assert main([*map(str, words), "--cache", str(tmp_path)]) == 0
     shown = capsys.readouterr()
-    said = " ".join(shown.err.split())
-    assert "0 results computed" in said and "10 fine-tuned" in shown.out
-    assert "left out, with fewer than 2 rows of one of their answers: bald, rare" in said
+    printed = " ".join(shown.err.split())
+    assert "0 results computed" in printed and "10 fine-tuned" in shown.out
+    assert "left out, with fewer than 2 rows of one of their answers: bald, rare" in printed
     wrong = ("compare", "--table", "identity", "-m", model, "-d", smiling, "--finetune")
     assert "give the linear table, models and images" in refused(*wrong)
 

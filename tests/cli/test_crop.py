@@ -40,9 +40,9 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
     whole = _run("decompose", photos, tmp_path / "whole", "--frame", "none")
     assert "or another crop (derender align, --frame)" in capsys.readouterr().err
     found = _run("decompose", photos, tmp_path / "framed", "--crop", "auto")
-    said = capsys.readouterr().err
-    assert "shown in part, 70 % of their side: 1 of 2 images" in said
-    assert "1 of 2 images are reconstructed worse than 99 %" in said  # chosen by that error: no acquittal
+    printed = capsys.readouterr().err
+    assert "shown in part, 70 % of their side: 1 of 2 images" in printed
+    assert "1 of 2 images are reconstructed worse than 99 %" in printed  # chosen by that error: no acquittal
     near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
     assert (near["side"], near["across"], near["down"], near["found"]) == (1.0, 0.0, 0.0, "auto")
     assert {one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, found)} == {100}

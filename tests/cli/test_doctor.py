@@ -19,18 +19,18 @@ def folder(tmp_path: Path) -> Path:
 
 def test_terminal_page_and_json_tell_the_same(folder: Path, tmp_path: Path, numbers):
     page = tmp_path / "doctor.html"
-    told, said = numbers("doctor", folder, "--out", page)
+    told, printed = numbers("doctor", folder, "--out", page)
     assert told["verdict"] == "does not suit" and told["distinct"] == 26 and told["identical"] == 1
     assert told["copies"] == [{"file": "26.png", "first": "00.png"}]
     assert [row["file"] for row in told["unreadable"]] == ["27.png"]
     assert told["originals"]["median_short"] == 64
-    assert f"verdict: does not suit, because {'; '.join(told['because'])}" in said
-    assert "unreadable: 27.png" in said
+    assert f"verdict: does not suit, because {'; '.join(told['because'])}" in printed
+    assert "unreadable: 27.png" in printed
     assert main(["doctor", str(folder)]) == 0 and main(["doctor", str(folder), "--check"]) == 1
     html = page.read_text()
     assert 'data-value="26">26' in html  # the table of measures: distinct images
     for finding in told["findings"]:
-        assert finding["text"] in html and finding["text"] in said
+        assert finding["text"] in html and finding["text"] in printed
 
 
 def test_what_exists_is_not_replaced_unasked(folder: Path, tmp_path: Path, refused):

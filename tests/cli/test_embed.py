@@ -44,13 +44,13 @@ def test_shards_with_a_cut_one_among_them(tiny, tmp_path, capsys):
     last = tmp_path / "set" / "s-1.tar"
     last.write_bytes(last.read_bytes()[:-12_000])
     assert embed(tiny, data, tmp_path / "f.parquet", "--json", tmp_path / "told.json") == 0
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     table = FeatureTable.read(tmp_path / "f.parquet")
     told = json.loads((tmp_path / "told.json").read_text())
     assert told["rows"] == len(table) < 20 and told["skipped"] == 1 and told["labels"] == ["class"]
-    assert f"{len(table)} images from {data} (webdataset), 1 skipped" in said.err
-    assert "skipped s-1.tar: damaged or cut short, what comes before counts" in said.err
-    assert "rows in" in said.out
+    assert f"{len(table)} images from {data} (webdataset), 1 skipped" in printed.err
+    assert "skipped s-1.tar: damaged or cut short, what comes before counts" in printed.err
+    assert "rows in" in printed.out
 
 
 def test_ctrl_c_leaves_only_what_the_next_run_goes_on_with(tiny, tmp_path, capsys, monkeypatch):

@@ -34,16 +34,16 @@ def folder(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("protocol", ["geometry", "reconstruction", "disentangle", "robustness"])
 def test_a_model_that_went_wrong_is_not_scored(protocol, folder, refused):
     data = ["-d", folder / "faces"] if protocol != "robustness" else []
-    said = refused("evaluate", protocol, "-m", folder / "broken", *data, "--cache", "none")
-    assert "has weights that are NaN or infinite (first nets.geometry." in said
+    printed = refused("evaluate", protocol, "-m", folder / "broken", *data, "--cache", "none")
+    assert "has weights that are NaN or infinite (first nets.geometry." in printed
 
 
 def test_labels_and_factors_that_ask_nothing(folder, refused):
     table = ("-f", folder / "ours.parquet", *ROOM)
-    said = refused("evaluate", "cluster", *table, "-l", "alone")
-    assert "every one of the 40 labelled rows of 'alone' is a class of its own" in said
-    said = refused("evaluate", "cluster", *table, "-l", "identity", "--factors", "geometri")
-    assert "unknown factor 'geometri'; did you mean 'geometry'" in said
+    printed = refused("evaluate", "cluster", *table, "-l", "alone")
+    assert "every one of the 40 labelled rows of 'alone' is a class of its own" in printed
+    printed = refused("evaluate", "cluster", *table, "-l", "identity", "--factors", "geometri")
+    assert "unknown factor 'geometri'; did you mean 'geometry'" in printed
     words = ("evaluate", "linear", *table, "-l", "identity")
-    said = refused(*words, "--counts", "10", "--groups", "identity")
-    assert "classes tested is learned from" in said and "these groups hold whole classes" in said
+    printed = refused(*words, "--counts", "10", "--groups", "identity")
+    assert "classes tested is learned from" in printed and "these groups hold whole classes" in printed

@@ -44,12 +44,12 @@ def test_a_copy_takes_half_the_bytes_and_says_nearly_the_same(unpacked, pictures
         Image.fromarray(picture.transpose(1, 2, 0)).save(folder / f"{index}.png")
     code = main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "p"), "-d", str(folder), "--json", "-"])
     assert code == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["bytes"] == {"before": bytes_of(unpacked), "after": bytes_of(tmp_path / "p")}
-    assert said["bytes"]["after"] < 0.52 * said["bytes"]["before"]
-    assert said["pictures"] == 12
-    assert all(0 < share < 0.05 for share in said["cost"]["moved"].values())
-    assert said["cost"]["l1"] == pytest.approx(said["cost"]["l1_before"], rel=0.01)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["bytes"] == {"before": bytes_of(unpacked), "after": bytes_of(tmp_path / "p")}
+    assert printed["bytes"]["after"] < 0.52 * printed["bytes"]["before"]
+    assert printed["pictures"] == 12
+    assert all(0 < share < 0.05 for share in printed["cost"]["moved"].values())
+    assert printed["cost"]["l1"] == pytest.approx(printed["cost"]["l1_before"], rel=0.01)
 
 
 def test_its_cost_is_that_of_the_features_it_gives(unpacked, pictures, tmp_path):

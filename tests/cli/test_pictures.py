@@ -132,15 +132,15 @@ def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, numb
     """It is not found itself, whatever its name, unless copies are asked for."""
     sheet, renamed = tmp_path / "sheet.png", shutil.copy(photos / "4.png", tmp_path / "mine.png")
     words = ("search", "-f", table, "--like", renamed, "--model", model, "-k", "3", "--out", sheet)
-    answer, said = numbers(*words)
+    answer, printed = numbers(*words)
     assert answer["same_picture"] == ["4.png"] and len(answer["found"]) == 3
     assert "4.png" not in {row["file"] for row in answer["found"]}
     distances = [row["distance"] for row in answer["found"]]
     assert distances == sorted(distances) and distances[0] > 1e-5
-    assert "left out as the very same image: 4.png (--copies" in said
-    answer, said = numbers(*words, "--copies", "--force")
+    assert "left out as the very same image: 4.png (--copies" in printed
+    answer, printed = numbers(*words, "--copies", "--force")
     found = answer["found"]
-    assert found[0]["file"] == "4.png" and len(found) == 3 and "4.png" in said
+    assert found[0]["file"] == "4.png" and len(found) == 3 and "4.png" in printed
     assert found[0]["distance"] == pytest.approx(0, abs=1e-5)
     with Image.open(sheet) as drawn:
         assert drawn.width > 4 * 160
@@ -159,8 +159,8 @@ def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers,
     folder, out = Path(shutil.copytree(photos, tmp_path / "folder")), tmp_path / "out"
     (folder / "bad.jpg").write_bytes(b"no picture")
     words = ("rotate", "-m", model, folder, "-o", out, "--size", 32, "--stills", 2, "--film", "none")
-    told, said = numbers(*words)  # exit code 0: of a folder the others are used
-    assert len(told["pictures"]) == 6 and "left out" in said and (out / "sheet.png").exists()
+    told, printed = numbers(*words)  # exit code 0: of a folder the others are used
+    assert len(told["pictures"]) == 6 and "left out" in printed and (out / "sheet.png").exists()
     sheet, write, left = (out / "sheet.png").read_bytes(), Edit.write, [1, 1, 1]
     shutil.rmtree(out)
 
@@ -178,8 +178,8 @@ def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers,
     assert (out / "sheet.png").read_bytes() == sheet and not (out / ".sheet").exists()  # with every picture
     shutil.rmtree(out / "3")
     kept = (out / "1" / "strip.png").stat().st_mtime_ns
-    told, said = numbers(*words, "--resume")
-    assert [Path(one["folder"]).name for one in told["pictures"]] == ["3"] and "5 images were done" in said
+    told, printed = numbers(*words, "--resume")
+    assert [Path(one["folder"]).name for one in told["pictures"]] == ["3"] and "5 images were done" in printed
     assert (out / "1" / "strip.png").stat().st_mtime_ns == kept
 
 
@@ -254,21 +254,21 @@ def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos
     for command in (["relight", *words], ["mesh", "--size", "32"], ["decompose"]):
         name, *rest = command
         assert main([name, "-m", model, str(one), "-o", str(tmp_path / f"no-{name}"), *rest]) == 0
-        said = capsys.readouterr().err
-        assert "reconstructed worse" not in said and "not in the crop" not in said
+        printed = capsys.readouterr().err
+        assert "reconstructed worse" not in printed and "not in the crop" not in printed
     write_errors(known, HeldOutErrors(np.linspace(0, 0.001, 101), 50))
     told = tmp_path / "told.json"
     words = ["--size", "32", "--from", str(two), "--factor", "light", "--json", str(told)]
     assert main(["swap", "-m", str(known), str(one), "-o", str(tmp_path / "swapped"), *words]) == 0
-    said = capsys.readouterr().err
-    assert "2 of 2 images are reconstructed worse than 99 % of those this model was validated on" in said
-    assert f"{one} is one" in said
+    printed = capsys.readouterr().err
+    assert "2 of 2 images are reconstructed worse than 99 % of those this model was validated on" in printed
+    assert f"{one} is one" in printed
     assert json.loads(told.read_text())["reconstruction_percentile"] == {str(one): 100, str(two): 100}
     write_errors(known, HeldOutErrors(np.linspace(0, 2, 101), 50))
     assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "usual"), "--size", "32"]) == 0
-    said = capsys.readouterr().err
-    assert "out-of-distribution" not in said
-    assert re.search(r"reconstructed worse than \d\d? % of the images this model was validated on", said)
+    printed = capsys.readouterr().err
+    assert "out-of-distribution" not in printed
+    assert re.search(r"reconstructed worse than \d\d? % of the images this model was validated on", printed)
     (known / ERRORS_FILE).write_text("{")
     assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "damaged"), "--size", "32"]) == 0
     assert "cannot find out-of-distribution images" in capsys.readouterr().err

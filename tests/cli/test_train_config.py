@@ -17,13 +17,13 @@ RUNS = ["rendered-faces", "faces", "cars", "cars-colours"]
 def settings(capsys):
     """All settings that `derender train` would run with."""
 
-    def said(*arguments: str | Path) -> dict:
+    def printed(*arguments: str | Path) -> dict:
         code = run("train", "--data", "nowhere", "--out", "nowhere/run", "--dry-run", *arguments)
         found = capsys.readouterr()
         assert code == 0, found.err
         return yaml.safe_load(found.out)
 
-    return said
+    return printed
 
 
 def test_a_file_says_what_set_says_and_set_comes_after(settings, tmp_path):

@@ -30,8 +30,8 @@ TINY = DemoSettings(
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """What the command's demo gave (``result``), the stages it reported, where it wrote, what it said."""
-    place, stages, said, results = tmp_path_factory.mktemp("demo"), [], StringIO(), []
+    """What the command's demo gave (``result``), the stages it reported, where it wrote, what it printed."""
+    place, stages, printed, results = tmp_path_factory.mktemp("demo"), [], StringIO(), []
 
     def heard(out: Path, settings: DemoSettings, *, report: Callable[..., None], **how):
         def told(stage: str, *at: object) -> None:
@@ -41,13 +41,13 @@ def told(tmp_path_factory):
         results.append(run_demo(place / out, settings, report=told, **how))
         return results[0]
 
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
         patch.setattr(package, "QUICK", TINY)
         patch.setattr(package, "run_demo", heard)
         patch.chdir(place)
         assert main(["demo", "--quick", "--seed", "3", "--json", "numbers.json"]) == 0
     stages = list(dict.fromkeys(stages))
-    return SimpleNamespace(result=results[0], stages=stages, place=place, said=said.getvalue())
+    return SimpleNamespace(result=results[0], stages=stages, place=place, printed=printed.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -87,18 +87,18 @@ def test_sentences_follow_the_numbers(told):
     side, mad = geometry.plane.side_each, np.ones_like(geometry.plane.mad_deg_each)
     better = replace(geometry.model, side_each=side / 100, mad_deg_each=0.1 * mad)
     worse = replace(geometry.model, side_each=100 * side, mad_deg_each=179.0 * mad)
-    for scores, said in ((better, "better than every control"), (worse, "behind the strongest control")):
+    for scores, printed in ((better, "better than every control"), (worse, "behind the strongest control")):
         other = GeometryResult(scores, geometry.average_depth, geometry.plane, None)
         changed = replace(result, geometry=other)
         tables = score_tables(changed)
-        assert all(said in tables["geometry"].verdict(column) for column in (0, 1))
+        assert all(printed in tables["geometry"].verdict(column) for column in (0, 1))
         html = demo_page(changed).html()
-        assert f"Depth</dt><dd>{said}" in html
+        assert f"Depth</dt><dd>{printed}" in html
         assert ("Not ahead of every control: depth" in html) == (scores is worse)
 
 
 def test_command_writes_page_and_numbers(told, html):
-    assert told.said.strip().splitlines()[-1] == "report derender-demo/report.html"
+    assert told.printed.strip().splitlines()[-1] == "report derender-demo/report.html"
     assert len(html) > 20_000
     numbers = json.loads((told.place / "numbers.json").read_text())
     assert numbers["geometry"]["plane"]["MAD"] > 0 and numbers["clustering"]["pixels"]["accuracy"] > 0

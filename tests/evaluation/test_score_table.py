@@ -22,7 +22,7 @@ BEHIND = "behind the strongest control"
 
 
 @pytest.mark.parametrize(
-    ("ours", "controls", "best", "said"),
+    ("ours", "controls", "best", "expected"),
     [
         (0.9, TWO, "high", "better than every control: 0.900 against 0.600 (pixels)"),
         (0.55, TWO, "high", "behind the strongest control: 0.550 against 0.600 (pixels), but ahead of pca"),
@@ -34,8 +34,8 @@ BEHIND = "behind the strongest control"
         (0.5, {"missing": None}, "high", "ours: 0.500 (score)"),
     ],
 )
-def test_verdict_compares(ours, controls, best, said):
-    assert table(ours, controls, best).verdict(0) == said
+def test_verdict_compares(ours, controls, best, expected):
+    assert table(ours, controls, best).verdict(0) == expected
 
 
 def test_verdict_leaves_out_rows_that_are_no_control():

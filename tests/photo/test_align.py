@@ -165,8 +165,8 @@ def test_a_table_of_a_stranger_is_refused_in_one_line(two_faces, tmp_path, table
         file.write_text(TABLES[table])
     for force in ([], ["--force"]):
         assert main(["align", str(two_faces), "--out", str(tmp_path / "out"), *force]) == 2
-        said = capsys.readouterr().err.splitlines()[-1]
-        assert "boxes.csv.partial is no table of derender align (" in said and len(said) < 400
+        printed = capsys.readouterr().err.splitlines()[-1]
+        assert "boxes.csv.partial is no table of derender align (" in printed and len(printed) < 400
 
 
 def test_a_model_of_other_objects_is_refused(photos, tmp_path):

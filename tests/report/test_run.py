@@ -30,8 +30,8 @@ def test_the_page_says_of_which_weights_the_model_is(tmp_path, keep, told):
     run = start_run(tmp_path / "run", resolve("small", [f"keep={keep}"]), {}, "cpu")
     for images, loss in ((32, 1.0), (64, 0.5), (96, 0.75)):
         append_metrics(run, {"kind": "validation", "images": images, "seconds": 1.0, "loss": loss})
-    said = "<dt>weights of the model</dt><dd>after 64 images, the best on held-out ones</dd>"
-    assert (said in run_page(run.path).html()) == told
+    printed = "<dt>weights of the model</dt><dd>after 64 images, the best on held-out ones</dd>"
+    assert (printed in run_page(run.path).html()) == told
 
 
 def test_only_first_last_and_evenly_chosen_samples_are_shown(tmp_path):

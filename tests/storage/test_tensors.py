@@ -22,7 +22,7 @@ def test_packed_numbers_are_off_by_half_a_unit_of_their_slice_at_most(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("tensors", "said"),
+    ("tensors", "message"),
     [
         ({"a.unit": torch.ones(1, 1)}, "the unit of no tensor"),
         ({"a": torch.ones(2, 2), "a.unit": torch.ones(1, 2)}, "the unit of no tensor"),
@@ -30,9 +30,9 @@ def test_packed_numbers_are_off_by_half_a_unit_of_their_slice_at_most(tmp_path, 
         ({"a": torch.ones(2, 2, dtype=torch.int8), "a.unit": torch.ones(1, 3)}, "does not fit"),
     ],
 )
-def test_units_that_do_not_fit_are_refused(tmp_path, tensors, said):
+def test_units_that_do_not_fit_are_refused(tmp_path, tensors, message):
     write_tensors(tensors, tmp_path / "t.safetensors")
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_tensors(tmp_path / "t.safetensors")
 
 

@@ -49,7 +49,7 @@ def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
     assert refined.errors["fitted"] < refined.errors["now"] < refined.errors["before"]
 
 
-def test_the_same_seed_teaches_the_same_and_nothing_else_is_touched(model, images):
+def test_the_same_seed_distils_the_same_and_nothing_else_is_touched(model, images):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.random.get_rng_state()
     one, again = (distillation.refine(model, images, images, changed(images=16), seed=5) for _ in range(2))
@@ -120,7 +120,7 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
     assert masked_l1(still.image[moved], shown[moved], still.mask[moved]) > 1.35 * errors[0]
 
 
-def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
+def test_a_copy_distilled_so_steps_back_from_smaller_faces(model, images):
     lessons = framed(images=480, rendered=0, fit_steps=4)
     learned = distillation.refine(model, images, images, lessons, seed=5).model
     assert learned.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
@@ -129,7 +129,7 @@ def test_a_copy_taught_so_steps_back_from_smaller_faces(model, images):
     smaller = crop_images(pictures, torch.tensor([[[1.7, 0, 0], [0, 1.7, 0]]]).expand(len(pictures), 2, 3))
     near, far = (learned.decompose(one).camera[:, 5] for one in (pictures, smaller))
     assert (far > near).float().mean() > 0.9
-    assert float(far.mean() - near.mean()) > 0.02, "the part of 0.7 that few examples teach"
+    assert float(far.mean() - near.mean()) > 0.02, "the part of 0.7 that few examples show"
 
 
 @pytest.mark.parametrize("renderer", ["phong+haze", "sh"])
@@ -172,7 +172,7 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
         distillation.refine(broken, images, images, changed(images=32, fit_steps=1))
 
 
-def test_only_clear_fits_teach():
+def test_only_clear_fits_are_distilled():
     """The worst, those that are no numbers and those that show nothing are left out."""
     error = torch.tensor([0.02, 0.03, 0.0, 0.01, 0.5])
     light = torch.rand(5, 4)

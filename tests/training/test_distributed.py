@@ -35,7 +35,7 @@ def free_port() -> str:
 
 
 def two_processes(*arguments: str) -> list[tuple[int, str]]:
-    """Run python with these arguments twice, as torchrun would; exit codes and what was said."""
+    """Run python with these arguments twice, as torchrun would; exit codes and what was printed."""
     common = {
         **os.environ, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "GROUP_RANK": "0",
         "TORCHELASTIC_RUN_ID": "test",
@@ -46,11 +46,11 @@ def two_processes(*arguments: str) -> list[tuple[int, str]]:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     running = [subprocess.Popen([sys.executable, *arguments], env=one, **pipes) for one in own]
     try:
-        said = [process.communicate(timeout=120)[0] for process in running]
+        printed = [process.communicate(timeout=120)[0] for process in running]
     finally:
         for process in running:
             process.kill()
-    return [(process.returncode, words) for process, words in zip(running, said, strict=True)]
+    return [(process.returncode, words) for process, words in zip(running, printed, strict=True)]
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def folder(tmp_path_factory) -> Path:
 def told(folder, tmp_path_factory) -> tuple[dict, list[list[str]], Path]:
     """Two processes that are refused a training, train, and compare steps.
 
-    Gives what the steps came to; what each process said of each command, its exit code last; and the run.
+    Gives what the steps came to; what each process printed of each command, its exit code last; and the run.
     """
     place = tmp_path_factory.mktemp("told")
     train_words = ["train", "--data", str(folder), "--preset", "small", "--device", "cpu"]
@@ -91,8 +91,8 @@ def told(folder, tmp_path_factory) -> tuple[dict, list[list[str]], Path]:
     script = str(Path(__file__).with_name("one_rank.py"))
     ended = two_processes(script, str(place / "found.json"), json.dumps(commands), free_port())
     assert [code for code, _ in ended] == [0, 0], ended
-    said = [re.split(r"(?<=\nended with \d)\n", words)[:2] for _, words in ended]
-    return json.loads((place / "found.json").read_text()), said, place
+    printed = [re.split(r"(?<=\nended with \d)\n", words)[:2] for _, words in ended]
+    return json.loads((place / "found.json").read_text()), printed, place
 
 
 def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch(told):
@@ -106,10 +106,10 @@ def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch
 
 @pytest.mark.usefixtures("one_thread")
 def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, told, tmp_path):
-    said, silence = (words[1] for words in told[1])
-    assert said.endswith("ended with 0") and silence.endswith("ended with 0")
+    printed, silence = (words[1] for words in told[1])
+    assert printed.endswith("ended with 0") and silence.endswith("ended with 0")
     assert "derender" not in silence and "images" not in silence
-    assert "stopped by: images" in said
+    assert "stopped by: images" in printed
     run = told[2] / "run"
     assert json.loads((run / "environment.json").read_text())["device"] == "2 x cpu"
     images = read_images(str(folder), 32)
@@ -128,12 +128,12 @@ def test_two_processes_train_one_run_that_one_process_can_go_on_with(folder, tol
 
 def test_what_fails_in_all_processes_is_said_once(told):
     each = [words[0] for words in told[1]]
-    said = "\n".join(each)
-    assert all(words.endswith("ended with 2") for words in each), said
-    complaints = [line for line in said.splitlines() if line.startswith("derender:")]
-    assert len(complaints) == 1, said
+    printed = "\n".join(each)
+    assert all(words.endswith("ended with 2") for words in each), printed
+    complaints = [line for line in printed.splitlines() if line.startswith("derender:")]
+    assert len(complaints) == 1, printed
     assert "batch_size 7 cannot be shared evenly by 2 processes: set batch_size=6" in complaints[0]
-    assert "Traceback" not in said
+    assert "Traceback" not in printed
     assert not (told[2] / "refused").exists()
 
 

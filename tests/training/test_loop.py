@@ -175,8 +175,8 @@ def test_the_command_says_of_which_weights_the_model_is(worsening, tmp_path, cap
     told = [part for setting in [*WORSENING, "split=[0.8,0.2,0]"] for part in ("--set", setting)]
     told += ["--preset", "small", "--data", str(tmp_path / "folder"), "--out", str(tmp_path / "run")]
     assert main(["train", *told]) == 0
-    said = " ".join(capsys.readouterr().err.split())
-    assert re.search(r"the model has the weights of (32|64) images, the best on held-out ones", said)
+    printed = " ".join(capsys.readouterr().err.split())
+    assert re.search(r"the model has the weights of (32|64) images, the best on held-out ones", printed)
     assert main(["train", *told, "--set", "keep=last", "--resume"]) == 0
     assert "the model has the weights" not in capsys.readouterr().err
     assert_model_is_of(tmp_path / "run", "last")

@@ -47,15 +47,15 @@ def test_ranges_may_be_changed_but_other_networks_cannot_take_the_weights(start)
         DerenderTask(wider).build()
 
 
-def test_a_taught_decoder_is_left_behind(tmp_path):
+def test_a_distilled_decoder_is_left_behind(tmp_path):
     settings = resolve("small", [*TINY, "encoder=unet", "unet_width=4"]).model
     network = settings.network.model_copy(update={"unet_decoder": True})
-    taught = derender.Derenderer.seeded(settings.model_copy(update={"network": network}), seed=3)
-    taught.save(tmp_path / "taught")
-    config = resolve("small", SHORT, start_from=str(tmp_path / "taught"))
+    distilled = derender.Derenderer.seeded(settings.model_copy(update={"network": network}), seed=3)
+    distilled.save(tmp_path / "distilled")
+    config = resolve("small", SHORT, start_from=str(tmp_path / "distilled"))
     begun = DerenderTask(config).build()
     assert begun.unet_decoder is None and config.model.network.encoder == "unet"
-    weights = taught.state_dict()
+    weights = distilled.state_dict()
     assert all(torch.equal(value, weights[name]) for name, value in begun.state_dict().items())
     with pytest.raises(ValueError, match="rendering trains none, derender unet distils one"):
         resolve("small", ["unet_decoder=true"])

@@ -84,7 +84,7 @@ def test_cycle_loss_is_zero_on_what_the_codes_say_and_grows_with_the_difference(
     assert cycle_loss(model, codes, turned, light_only).item() == pytest.approx(0, abs=1e-6)
 
 
-def test_cycle_loss_teaches_the_readers_not_the_scene(model, images):
+def test_cycle_loss_trains_the_encoders_not_the_scene(model, images):
     model.zero_grad(set_to_none=True)
     codes = {name: code.detach() for name, code in model.embed(images).items()}
     scene = model.decompose(images)

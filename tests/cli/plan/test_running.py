@@ -103,9 +103,9 @@ def test_the_same_command_again_does_nothing_twice(plan, whole, capsys):
     before, weights = scores(whole), whole / "runs" / "colours" / "ae" / "model" / "model.safetensors"
     at = weights.stat().st_mtime_ns
     assert main(["compare", "--plan", str(plan), "--out", str(whole)]) == 0
-    said = capsys.readouterr().err
-    assert "train gone on colours: failed" in said  # tried again: it may have come
-    assert "train ae" not in said and "score people" not in said
+    printed = capsys.readouterr().err
+    assert "train gone on colours: failed" in printed  # tried again: it may have come
+    assert "train ae" not in printed and "score people" not in printed
     assert scores(whole) == before and weights.stat().st_mtime_ns == at
 
 
@@ -135,10 +135,10 @@ def test_the_budget_ends_a_training_and_leaves_tables(plan, whole, monkeypatch, 
         patch.setattr(loop._Run, "step", slow_step)
         patch.setattr(time, "time", lambda: now[0])
         assert main([*words, "--minutes", "1.5"]) == 0
-    said = capsys.readouterr().err
-    assert "the budget is used; the same command continues where it stopped" in said
+    printed = capsys.readouterr().err
+    assert "the budget is used; the same command continues where it stopped" in printed
     assert run_progress(out / "runs" / "colours" / "ae")["images"] == 32
-    assert "missing: train ae on colours: the budget was used before it was done (32 of 64" in said
+    assert "missing: train ae on colours: the budget was used before it was done (32 of 64" in printed
     told = json.loads((out / "clustering.json").read_text())
     assert "ae" not in told["questions"][0]["rows"] and "pixels" in told["questions"][0]["rows"]
     assert told["questions"][0]["absent"]["ae"].startswith("missing: ")
