@@ -37,26 +37,20 @@ SCORES := heads brightness people cars-clusters cars-geometry
 results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
 	@$(BIN)/python docs/pages.py
 
-$(DATA)/heads: | $(STAMP)
-	@rm -rf $@.part; $(BIN)/derender synth faces --out $@.part --count 400 --seed 11 && mv $@.part $@
-$(DATA)/tracks: | $(STAMP)
-	@rm -rf $@.part; $(BIN)/derender synth faces --out $@.part --identities 12 --tracks 10 --frames 6 --seed 11 \
-	  --light wide --view wide && mv $@.part $@
-$(DATA)/cars: | $(STAMP)
-	@rm -rf $@.part; $(BIN)/derender synth cars --out $@.part --count 500 --seed 11 --set pictures_per_model=1 \
-	  --classes police,ambulance,limousine,jeep,sports && mv $@.part $@
+$(DATA)/%: | $(STAMP)
+	@rm -rf $@.part; $(BIN)/derender synth $* --benchmark --out $@.part && mv $@.part $@
 
-HEADS := evaluate geometry $(DATA)/heads --model rendered-faces-64
-BRIGHTNESS := evaluate brightness $(DATA)/heads --model rendered-faces-64
-PEOPLE := evaluate cluster $(DATA)/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
-CARS-CLUSTERS := evaluate cluster $(DATA)/cars --model cars-64 --label class
-CARS-GEOMETRY := evaluate geometry $(DATA)/cars --model cars-64
+HEADS := evaluate geometry $(DATA)/faces/test --model rendered-faces-64
+BRIGHTNESS := evaluate brightness $(DATA)/faces/test --model rendered-faces-64
+PEOPLE := evaluate cluster $(DATA)/faces/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
+CARS-CLUSTERS := evaluate cluster $(DATA)/cars/test --model cars-64 --label class
+CARS-GEOMETRY := evaluate geometry $(DATA)/cars/test --model cars-64
 SCORE = @$(BIN)/python benchmarks/score.py $@
-$(RESULTS)/heads.json: | $(DATA)/heads
+$(RESULTS)/heads.json: | $(DATA)/faces
 	$(SCORE) $(HEADS)
-$(RESULTS)/brightness.json: | $(DATA)/heads
+$(RESULTS)/brightness.json: | $(DATA)/faces
 	$(SCORE) $(BRIGHTNESS)
-$(RESULTS)/people.json: | $(DATA)/tracks
+$(RESULTS)/people.json: | $(DATA)/faces
 	$(SCORE) $(PEOPLE)
 $(RESULTS)/cars-clusters.json: | $(DATA)/cars
 	$(SCORE) $(CARS-CLUSTERS)

@@ -1,6 +1,6 @@
 """The pictures of the site that models made: docs/images/gallery, made anew by one command.
 
-    .venv/bin/python examples/gallery.py                             # heads of `derender synth`
+    .venv/bin/python examples/gallery.py                             # test heads of the generated benchmark
     .venv/bin/python examples/gallery.py --data heads.zip::test      # a rendered set with true maps
     .venv/bin/python examples/gallery.py --only swap                 # one picture
 
@@ -131,14 +131,14 @@ PICTURES = {"decompose": decompose, "swap": swap, "search": search, "explain": e
 
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--data", help="rendered heads with true maps; by default derender synth makes them")
+    words.add_argument("--data", help="rendered heads with true maps; by default the generated benchmark's")
     words.add_argument("--only", choices=PICTURES, action="append", help="make these pictures only")
     given = words.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        data = given.data or str(work / "made")
+        data = given.data or str(work / "made" / "test")
         if given.data is None:
-            run("synth", "faces", "--out", data, "--count", SEARCHED)
+            run("synth", "faces", "--benchmark", "--out", work / "made")
         for name in given.only or PICTURES:
             PICTURES[name](data, work)
             print(name)
