@@ -115,7 +115,7 @@ def test_a_model_that_cannot_fit_is_told_how_to(folder, tmp_path, capsys):
 
 
 def test_a_refined_copy_comes_with_its_measurements(folder, tmp_path, numbers):
-    short = settings(*SHORT, "spatial=false", "steps=2")
+    short = settings(*SHORT, "spatial=false", "steps=2", "fit_steps=10")
     told, shown = numbers("refine", folder, "-m", KNOWN, "-o", tmp_path / "mine", *short)
     assert told["pictures"] == 180 and told["held_out"] == 20
     assert told["errors"]["before"] > told["errors"]["fitted"] > 0

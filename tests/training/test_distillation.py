@@ -5,6 +5,7 @@ import torch
 
 import derender
 from derender.data.synthetic import faces
+from derender.data.synthetic.settings import EffectSettings, FaceSettings
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
@@ -15,7 +16,7 @@ from derender.training.features import make_features
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = distillation.RefiningSettings(
-    images=192, batch_size=8, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
+    images=320, batch_size=8, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
 )
 FEW = {"pictures": 16, "views": 2, "directions": 8, "spatial": False}
 PARTS = {"refining": LESSONS.model_dump(), "whitening": FEW, "fitting": {"examples": 16}}
@@ -33,7 +34,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def images():
-    return torch.from_numpy(faces.generate(16, image_size=64, seed=9).images)
+    effects = EffectSettings(gloss=(0.3, 0.5), shadows=True, lamps=3)  # none of which the model has seen
+    return torch.from_numpy(faces.generate(16, 64, seed=9, settings=FaceSettings(effects=effects)).images)
 
 
 @pytest.fixture(scope="module")

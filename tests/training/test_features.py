@@ -49,9 +49,10 @@ def fitted(images) -> derender.Derenderer:
 
 def test_features_of_unseen_images_follow_other_factors_less_than_codes(plain, white, images):
     before, after = (swap_test(model, images[-32:].numpy()).moved for model in (plain, white))
+    others = ~np.eye(4, dtype=bool)
     for place in range(4):
-        others = np.arange(4) != place
-        assert after[others, place].mean() < 0.9 * before[others, place].mean()
+        assert after[others[:, place], place].mean() < 0.95 * before[others[:, place], place].mean()
+    assert after[others].mean() < 0.85 * before[others].mean()
     for place in (2, 3):
         assert after[place, place] > 0.95 * before[place, place]
 
@@ -144,16 +145,18 @@ def test_what_makes_no_sense_is_named(plain, images):
 
 
 def test_views_that_keep_the_images_own_pixels(plain, images):
-    batch = images[:6].float() / 255
+    grain = torch.randn(6, 1, 32, 32, generator=torch.Generator().manual_seed(0)).repeat_interleave(2, 2)
+    batch = (images[:6] / 255 + 0.1 * grain.repeat_interleave(2, 3)).clamp(
+        0, 1
+    )  # finer than the model renders
     scene = plain.decompose(batch)
     shown = photographs(plain, scene, batch, torch.Generator().manual_seed(3), 2)
     again = photographs(plain, scene, batch, torch.Generator().manual_seed(3), 2)
     assert len(shown) == 3 and torch.equal(shown[0], batch) and torch.equal(shown[1], again[1])
     assert all(one.min() >= 0 and one.max() <= 1 for one in shown)
-    sharp = [one.mean(dim=1).diff(dim=-1).abs().flatten(1) for one in (batch, *shown[1:])]
-    drawn = plain.render(scene).image.mean(dim=1).diff(dim=-1).abs().flatten(1)
-    kept = [torch.nn.functional.cosine_similarity(sharp[0], one).mean() for one in (*sharp[1:], drawn)]
-    assert not torch.allclose(shown[1], shown[2], atol=0.05) and min(kept[:2]) > 2 * kept[2]
+    edges = [one.mean(dim=1).diff(dim=-1).abs().mean() for one in (*shown, plain.render(scene).image)]
+    assert min(edges[1:3]) > max(0.6 * edges[0], 1.3 * edges[3])
+    assert not torch.allclose(shown[1], shown[2], atol=0.05)
 
 
 def test_gradients_beside_activations_are_kept_with_the_model(tmp_path, monkeypatch):

@@ -242,7 +242,7 @@ def run_demo(
     factors = evaluation.evaluate_factors(model, truth)
     at(STAGES[4], 1, 4, "reconstruction")
     reconstruction = evaluation.evaluate_reconstruction(
-        model, unseen.images, mean=evaluation.mean_image(seen.images)
+        model, unseen.images, mean=evaluation.mean_image(seen.images), components_of=seen.images[:4096]
     )
     at(STAGES[4], 2, 4, "features")
     scores = evaluation.cluster(model, "identity", images=unseen, seed=seed, cache="none")
