@@ -2,10 +2,10 @@
 
 Extended Yale B (``--yale``, the cropped set or a zip of it): the picture of each person in frontal light is
 given the light of each other picture, by the angle between light and view. Heads are generated at 256 pixels,
-the same head once more in the new light or view, so that the truth is exact. PSNR in dB and SSIM, where the
-model draws a surface. Beside derender's edits: the model's own rendering, the unchanged input, the input with
-the brightness of the truth, the ratio of another person's two pictures, and for views the input turned as a
-plane.
+one a person, the same head once more in the new light or view, so that the truth is exact. PSNR in dB and
+SSIM, where the model draws a surface. Beside derender's edits: the model's own rendering, the unchanged
+input, the input with the brightness of the truth, the ratio of another person's two pictures, and for views
+the input turned as a plane.
 
     .venv/bin/python benchmarks/photo_edits.py --yale yaleb.zip --json benchmarks/results/photo_edits.json
 """
@@ -133,7 +133,8 @@ def heads(model: derender.Derenderer, count: int, seed: int) -> dict[str, dict[s
     def made(yaw_light: float = 0.0, yaw_view: float = 0.0) -> tuple[Tensor, Tensor]:
         lit = light.model_copy(update={"yaw_deg": (yaw_light, yaw_light)})
         seen = view.model_copy(update={"yaw_deg": (yaw_view, yaw_view)})
-        found = faces.generate(count, SIZE["heads"], seed, FaceSettings(light=lit, view=seen))
+        settings = FaceSettings(light=lit, view=seen, pictures_per_identity=1)
+        found = faces.generate(count, SIZE["heads"], seed, settings)
         return torch.from_numpy(found.images).float() / 255, torch.from_numpy(found.mask > 0)
 
     photos, masks = made()

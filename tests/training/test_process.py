@@ -24,20 +24,14 @@ def test_the_switch_is_turned_back(before, deterministic):
 
 
 FAULTS = """
-import resource
-import torch
+import resource, torch
 from derender.training.process import freed_memory_kept
-
-def faults():  # minor ones, while a block of 64 MB is filled and freed ten times
+def faults():  # minor ones, while a block of 64 MB is filled and freed twenty times
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(10):
-        torch.ones(16 * 2**20)
+    [torch.ones(16 * 2**20) is None for _ in range(20)]
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-faults()
 outside = faults()
 with freed_memory_kept() as kept:
-    faults()
     print(int(kept), outside, faults())
 """
 

@@ -4,12 +4,15 @@ A model sees 64 or 128 pixels; a photograph has more. Geometry and light vary sl
 coarse grid and enlarged: where each point of the new image lies in the photograph, and by how much its
 shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
 back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
-model's albedo, moved to the photograph's colours; the three blend. Around the surface, motion and shading go
-on and fade out: hair, neck and background follow. The more shading changes, the more the model's colours
-weigh: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
-as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
-and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
+model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface goes
+on and runs out into a plane through the object's centre: hair, neck and background follow and come to rest.
+The more shading changes, the more the model's colours weigh: what it explained wrongly would otherwise stay
+in the surface. Shading multiplies coded (sRGB) values, as in training: on Extended Yale B that is nearer to
+the truth than the same ratio in linear light. Highlights and haze that the renderer knows are taken off and
+drawn anew; what they cannot explain stays.
 """
+
+from math import atan, degrees, radians, tan
 
 import torch
 from jaxtyping import Float
@@ -19,23 +22,24 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 from derender.render import Rendering, warp
 from derender.renderers import Renderer
 from derender.scene import Scene
-from derender.scene.camera import project, to_camera, unproject
+from derender.scene.camera import OBJECT_CENTRE, project, to_camera, unproject
 from derender.scene.enlarge import at_size
 
 GRID = 256
 """Largest side of the grid on which geometry and shading are drawn."""
 
-FACING = (0.15, 0.40)  # cosine between surface and ray: below, a photograph tells nothing, above, all
-MOVED = (0.01, 0.03)  # shares of the side: what moves less than the first is always the photograph's
-LIT = (0.10, 0.25)  # shading, likewise
+FACING = (0.20, 0.45)  # cosine between surface and ray: below, a photograph tells nothing, above, all
+MOVED = (0.01, 0.03)  # shares of the side: if nothing moves more than the first, all is the photograph's
+LIT = (0.10, 0.25)  # shading, as FACING
 LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
 DISTRUST = 4.0  # the weight of the photograph's detail is 1 / (1 + DISTRUST m²), m the mean squared log ratio
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
-FEATHER_SHARE = 1 / 32  # width of the blends, of the image's width
+FEATHER_SHARE = 1 / 20  # width of the blends, of the image's width
 COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
 COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carried over from
-RIM_SHARE = 0.05  # of the side: the surface's rim, where a model's depth ends in a wall
-FADE_SHARE = 1 / 8  # reach of motion and shading beyond the surface
+RIM_SHARE = 0.04  # of the side: the rim of the model's maps, where depth ends in a wall
+REACH_SHARE = 1 / 4  # of the side: how far the surface goes on around them, at least
+FADE_SHARE = 1 / 8  # reach of new shading around them
 DARKEST = 1e-3
 LAMBERT = Renderer("lambert")
 
@@ -64,53 +68,76 @@ class PhotoDetail:
         self.size, self.span = photo.shape[-1], 1 + 2 * margin
         self.grid = min(max(GRID, self.model_size), self.size)
         self.rim = round(margin * self.grid)
-        own = at_size(scene.detach(), self.grid)
-        points = to_camera(unproject(own.depth, fov_deg), own.camera)
-        self._place = project(points, self.grid, self.grid, fov_deg).permute(0, 3, 1, 2)
+        self.reach = max(self.rim, round(REACH_SHARE * self.grid))
+        self.wide = self.grid + 2 * self.reach
+        self.wide_fov = 2 * degrees(atan(tan(radians(fov_deg) / 2) * (self.wide - 1) / (self.grid - 1)))
+        own = self._widened(scene.detach())
+        points = to_camera(unproject(own.depth, self.wide_fov), own.camera)
+        self._place = project(points, self.wide, self.wide, self.wide_fov).permute(0, 3, 1, 2)
         self.renderer = renderer
-        self._shading, self._veil = self._light(own), renderer.veil(own, fov_deg)
+        self._shading, self._veil = self._light(own), renderer.veil(own, self.wide_fov)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours = self._completed(own)
-        at_home = warp(self._place, own.depth, own.camera, fov_deg)
-        self._off = (at_home.image - self._pixels()) * at_home.mask[:, None]  # what rounding leaves
+        at_home = self._warped(self._place, own)
+        off = (at_home.image - self._pixels()) * at_home.mask[:, None]
+        self._off = off * (off.norm(dim=1, keepdim=True) < 1)  # what rounding leaves; more is hidden surface
 
     def __call__(self, scene: Scene) -> Rendering:
         """Images (N, 3, S, S) of scenes that differ from the photograph's in light, camera or depth.
 
         Albedo is the photograph's, whatever they hold. The mask is 1: around the surface is the photograph.
         """
-        scene = at_size(scene, self.grid)
-        count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.fov_deg)
+        scene = self._widened(scene)
+        count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.wide_fov)
         own = torch.cat((self._place, self._seen, self._shading, self._veil), dim=1)
-        within = self._margin(RIM_SHARE)
-        maps = torch.cat((own, own.flip(-1), self._colours, within), dim=1).expand(count, -1, -1, -1)
-        view = warp(torch.cat((maps, shading, veil), dim=1), scene.depth, scene.camera, self.fov_deg)
+        edge = -RIM_SHARE - FEATHER_SHARE / 2
+        reach = self._around(edge - FEATHER_SHARE, edge)
+        maps = torch.cat((own, own.flip(-1), self._colours, reach), dim=1).expand(count, -1, -1, -1)
+        view = self._warped(torch.cat((maps, shading, veil), dim=1), scene)
         sizes = (own.shape[1], own.shape[1], 3, 1, 1, veil.shape[1])
-        own, mirrored, colours, within, shading, veil = view.image.split(sizes, dim=1)
+        own, mirrored, colours, inside, shading, veil = view.image.split(sizes, dim=1)
+        covered = view.mask[:, None]
         place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
-        moved = shift.norm(dim=1, keepdim=True) / self.grid
-        seen = torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED))
+        moved = (inside * shift.norm(dim=1, keepdim=True)).amax(dim=(2, 3), keepdim=True) / self.grid
+        seen = 1 - inside * (1 - torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED)))
+        mirror_seen = inside * (1 - seen) * mirrored[:, 2:3]
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
-        mask = (within > 0.99).to(within)
-        log_ratio = ratio.log()
-        change = (log_ratio.square() * mask).sum(dim=(2, 3)) / mask.sum(dim=(2, 3)).clamp(min=1)
-        trust = 1 / (1 + DISTRUST * change.square())
-        mask, shift, log_ratio = self._continued(mask, shift, log_ratio)
-        maps = (mirror_shift, mirror_ratio, colours * shading, seen, (1 - seen) * mirrored[:, 2:3])
-        mirror_shift, mirror_ratio, drawn, seen, mirror_seen, *veils = (
-            pad(field, (self.rim,) * 4) for field in (*maps, own[:, 4:], mirrored[:, 4:], veil)
-        )
-        seen, mirror_seen = 1 - mask * (1 - seen), mask * mirror_seen
-        trust = 1 - mask * (1 - trust[:, :, None, None])
-        mirror_ratio = mirror_ratio.clamp(min=DARKEST)
-        fields = (shift, mirror_shift, seen, mirror_seen, log_ratio.exp(), mirror_ratio, drawn)
-        image = self._composed((*fields, *(mask * one for one in veils)), trust)
-        depth = self._enlarged(pad(view.depth[:, None], (self.rim,) * 4))[:, 0]
+        change = (ratio.log().square() * inside).sum(dim=(2, 3)) / inside.sum(dim=(2, 3)).clamp(min=1)
+        trust = 1 - inside * (1 - 1 / (1 + DISTRUST * change.square()))[:, :, None, None]
+        shift = _filled(shift * covered, covered) * self._inward().to(shift)
+        veils = (inside * one for one in (own[:, 4:], mirrored[:, 4:], veil))
+        faded, drawn = self._faded(ratio, inside), colours * shading
+        fields = (shift, mirror_shift, seen, mirror_seen, faded, mirror_ratio, drawn, *veils)
+        image, depth = self._composed(fields, trust), self._enlarged(view.depth[:, None])[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
+    def _faded(self, ratio: Tensor, inside: Float[Tensor, "n 1 w w"]) -> Float[Tensor, "n 1 w w"]:
+        """Ratios of shading inside the model's maps, which continue around it and fade to 1."""
+        mask = (inside > 0.99).to(inside)
+        near = torch.maximum(mask, _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25))
+        return (_filled(ratio.log() * mask, mask) * near**2).exp()
+
+    def _widened(self, scene: Scene) -> Scene:
+        """On the wide grid. The surface goes on around the model's maps and ends in a plane at the centre."""
+        scene, edge = at_size(scene, self.grid), round(RIM_SHARE * self.grid)
+        inner = scene.depth[:, None, edge:-edge, edge:-edge]
+        level = pad(inner, (edge + self.reach,) * 4, mode="replicate")[:, 0]
+        near = self._around(-RIM_SHARE, self.reach / self.grid)[:, 0]
+        depth = OBJECT_CENTRE[2] + near * (level - OBJECT_CENTRE[2])
+        albedo = pad(scene.albedo, (self.reach,) * 4, mode="replicate")
+        return scene.with_parameters(depth=depth, albedo=albedo)
+
+    def _warped(self, maps: Tensor, scene: Scene) -> Rendering:
+        return warp(maps, scene.depth, scene.camera, self.wide_fov)
+
+    def _around(self, full: float, none: float) -> Float[Tensor, "1 1 w w"]:
+        """1 up to so far outside the model's maps (shares of the side, negative inside), falling to 0."""
+        along = (torch.arange(self.wide) - (self.wide - 1) / 2).abs() / self.grid - 0.5
+        return _ramp(-torch.maximum(along, along[:, None]), -none, -full)[None, None].to(self.photo)
+
     def _light(self, scene: Scene) -> Float[Tensor, "n 1 h w"]:
-        return self.renderer.shading(scene, self.fov_deg).mean(dim=1, keepdim=True)
+        return self.renderer.shading(scene, self.wide_fov).mean(dim=1, keepdim=True)
 
     def albedo(self) -> Float[Tensor, "1 3 s s"]:
         """The texture of the canonical view: the photograph without its shading, completed."""
@@ -119,30 +146,19 @@ class PhotoDetail:
         weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
         fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
         fields += (self._veil, self._veil.flip(-1), 0 * self._veil)
-        return self._composed(tuple(pad(field, (self.rim,) * 4) for field in fields), torch.ones(1, 1, 1, 1))
+        return self._composed(fields, torch.ones(1, 1, 1, 1))
 
-    def _continued(self, mask: Tensor, shift: Tensor, log_ratio: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """How far inside the surface, 0..1; shift and ratio continue around it and fade. On the wide grid."""
-        reach = round(RIM_SHARE * self.grid)
-        mask = pad(_eroded(pad(mask, (reach,) * 4), reach), (-reach,) * 4)
-        mask, fields = (pad(field, (self.rim,) * 4) for field in (mask, torch.cat((shift, log_ratio), dim=1)))
-        near = _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25)
-        near = torch.maximum(mask, near)
-        shift, log_ratio = _filled(fields * mask, mask).split((2, 1), dim=1)
-        inside = mask * _ramp(_blurred(mask, 2 * FEATHER_SHARE * self.grid), 0.5, 1.0)
-        return inside, shift * self._inward().to(shift), log_ratio * near**2
-
-    def _inward(self) -> Float[Tensor, "h w"]:
+    def _inward(self) -> Float[Tensor, "w w"]:
         """1 in the crop, falling to 0 at the border of the photograph around it."""
-        along = torch.arange(self.grid + 2 * self.rim) + 0.5
+        along = torch.arange(self.wide) + 0.5 - self.reach + self.rim
         depth = torch.minimum(along, along.flip(0))
-        rise = torch.ones_like(depth) if self.rim == 0 else (depth / self.rim).clamp(max=1)
+        rise = torch.ones_like(depth) if self.rim == 0 else (depth / self.rim).clamp(0, 1)
         return rise * rise[:, None]
 
     def _composed(
         self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"]
     ) -> Float[Tensor, "n 3 s s"]:
-        """Images at the photograph's size, from fields on the wider grid.
+        """Images at the photograph's size, from fields on the wide grid.
 
         Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
         model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
@@ -172,11 +188,10 @@ class PhotoDetail:
         return _veiled(surface, new) + _veiled(clear, veil) - _veiled(kept, veil)
 
     def _enlarged(self, fields: Tensor) -> Tensor:
-        """Fields of the wider grid at the photograph's pixels; its border is continued."""
+        """Fields of the wide grid at the photograph's pixels."""
         places = ((torch.arange(self.size) + 0.5) / self.size - 0.5) * self.span * self.model_size
         across = places / (self.model_size - 1) * (self.grid - 1)  # from the middle, in grid pixels
-        centres = _square(across * 2 / (self.grid - 1 + 2 * self.rim)).to(fields)
-        centres = centres.expand(len(fields), -1, -1, -1)
+        centres = _square(across * 2 / (self.wide - 1)).to(fields).expand(len(fields), -1, -1, -1)
         return grid_sample(fields, centres, padding_mode="border", align_corners=True)
 
     def on_grid(self, image: Float[Tensor, "1 3 s s"], size: int) -> Float[Tensor, "1 3 size size"]:
@@ -191,9 +206,9 @@ class PhotoDetail:
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
-        photo = _look_up(self.on_grid(self.photo[None], self.grid), self._place)
+        photo = _look_up(self.on_grid(self.photo[None], self.grid), self._place - self.reach)
         bare = (_cleared(photo, self._veil) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
-        inner = self._seen * self._margin(COLOUR_MARGIN)
+        inner = self._seen * self._around(-COLOUR_MARGIN - FEATHER_SHARE, -COLOUR_MARGIN)
         weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)
         known = weight + mirror_weight
         difference = weight * bare + mirror_weight * bare.flip(-1) - known * own.albedo
@@ -202,9 +217,10 @@ class PhotoDetail:
 
     def _visible(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 g g"]:
         """How well the photograph shows each canonical point, 0..1."""
-        view = warp(own.albedo[:, :1], own.depth, own.camera, self.fov_deg)
+        view = self._warped(own.albedo[:, :1], own)
         front = _look_up(view.depth[:, None], self._place, "nearest")
-        inside = ((self._place >= 0) & (self._place <= self.grid - 1)).all(dim=1, keepdim=True)
+        start = self.reach - self.rim
+        inside = ((self._place >= start) & (self._place < self.wide - start)).all(dim=1, keepdim=True)
         visible = inside & (points[..., 2][:, None] <= front + HIDDEN_BEHIND) & (front > 0)
         share = visible * _ramp(_facing(points), *FACING)[:, None]
         reach = max(1, round(FEATHER_SHARE * self.grid))
@@ -212,13 +228,8 @@ class PhotoDetail:
             _eroded(share, reach), 2 * reach + 1, stride=1, padding=reach, count_include_pad=False
         )
 
-    def _margin(self, share: float) -> Float[Tensor, "1 1 g g"]:
-        """1 in the canonical map, 0 within a share of its side from its border."""
-        edge = round(share * self.grid)
-        return pad(torch.ones_like(self._seen[..., edge:-edge, edge:-edge]), (edge,) * 4)
-
     def _pixels(self) -> Float[Tensor, "1 2 g g"]:
-        return _square(torch.arange(self.grid).float()).permute(0, 3, 1, 2).to(self.photo)
+        return _square(torch.arange(self.wide).float()).permute(0, 3, 1, 2).to(self.photo)
 
 
 def _square(along: Tensor) -> Float[Tensor, "1 k k 2"]:

@@ -87,8 +87,10 @@ class Photograph:
     @torch.inference_mode()
     def __call__(self, scene: Scene) -> Rendering:
         """Whole photographs (N, 3, H, W) of scenes that differ from its own; the mask is 1, depth is 0."""
-        drawn = self.detail(scene).image
-        wholes = [self.surroundings.paste(self.pixels, self.detail.photo, one) for one in drawn]
+        drawn, own = self.detail(scene).image, self.scene
+        moved = not torch.equal(scene.camera, own.camera.expand_as(scene.camera))
+        moved |= not torch.equal(scene.depth, own.depth.expand_as(scene.depth))
+        wholes = [self.surroundings.paste(self.pixels, self.detail.photo, one, moved) for one in drawn]
         images = torch.from_numpy(np.stack(wholes)).permute(0, 3, 1, 2).float() / 255
         return Rendering(images, torch.zeros_like(images[:, 0]), torch.ones_like(images[:, 0]))
 

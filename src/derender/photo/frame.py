@@ -11,10 +11,13 @@ import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, max_pool2d
 
 BORDER_SHARE = 1 / 16
 """Width over which an edited crop fades into its photograph, of the crop's side."""
+
+GONE = 0.05
+"""Change from which a moved thing's fine detail is gone from where it was."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,12 @@ class Frame:
         photo: UInt8[np.ndarray, "h w 3"],
         before: Float[Tensor, "3 s s"],
         after: Float[Tensor, "3 s s"],
+        moved: bool = False,
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """The photograph with an edited crop (0..1): what changed is added, so the rest keeps its pixels."""
+        """The photograph with an edited crop (0..1): what changed is added, so the rest keeps its pixels.
+
+        Detail finer than the crop stays where it is; where things ``moved``, it goes with what is changed.
+        """
         height, width = photo.shape[:2]
         across, down = zip(*self.corners(), strict=True)
         left, top = max(0, int(min(across))), max(0, int(min(down)))
@@ -113,11 +120,16 @@ class Frame:
         grid = torch.stack(
             (cos(angle) * u + sin(angle) * v, cos(angle) * v - sin(angle) * u), dim=-1
         )[None].float()  # fmt: skip
-        added = grid_sample(change, grid, mode="bilinear", padding_mode="zeros", align_corners=False)[0]
+        both = torch.cat((change, before[None].cpu()), dim=1)
+        both = grid_sample(both, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        added, old = both.split(3, dim=1)
         pasted = photo.copy()
-        region = torch.from_numpy(photo[top:bottom, left:right].astype(np.float32))
-        moved = (region + 255 * added.permute(1, 2, 0)).round().clamp(0, 255)
-        pasted[top:bottom, left:right] = moved.to(torch.uint8).numpy()
+        region = torch.from_numpy(photo[top:bottom, left:right].astype(np.float32) / 255).permute(2, 0, 1)
+        if moved:
+            gone = (max_pool2d(added.abs().amax(dim=1), 5, stride=1, padding=2) / GONE).clamp(0, 1)
+            added = added + gone * (old - region)
+        edited = (255 * (region + added[0])).round().clamp(0, 255)
+        pasted[top:bottom, left:right] = edited.permute(1, 2, 0).to(torch.uint8).numpy()
         return pasted
 
 
