@@ -4,8 +4,8 @@ A model sees 64 or 128 pixels; a photograph has more. Geometry and light vary sl
 coarse grid and enlarged: where each point of the new image lies in the photograph, and by how much its
 shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
 back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
-model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface goes
-on and runs out into a plane through the object's centre: hair, neck and background follow and come to rest.
+model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface continues
+into a plane through the object's centre: hair, neck and background follow and come to rest.
 The more shading changes, the more the model's colours weigh: what it explained wrongly would otherwise stay
 in the surface. Shading multiplies coded (sRGB) values, as in training: on Extended Yale B that is nearer to
 the truth than the same ratio in linear light. Highlights and haze that the renderer knows are taken off and
@@ -119,7 +119,7 @@ class PhotoDetail:
         return (_filled(ratio.log() * mask, mask) * near**2).exp()
 
     def _widened(self, scene: Scene) -> Scene:
-        """On the wide grid. The surface goes on around the model's maps and ends in a plane at the centre."""
+        """On the wide grid. The surface continues around the model's maps into a plane at the centre."""
         scene, edge = at_size(scene, self.grid), round(RIM_SHARE * self.grid)
         inner = scene.depth[:, None, edge:-edge, edge:-edge]
         level = pad(inner, (edge + self.reach,) * 4, mode="replicate")[:, 0]
