@@ -30,7 +30,7 @@ import torch
 from machine import parser, publish
 from PIL import Image
 from torch import nn
-from training_step import CONFIG, OurStep
+from training_step import CONFIG, OurStep, seconds
 
 from derender.data import Sample, Stream, as_float, open_images
 from derender.features import FeatureTable, embed_images, embed_to_file
@@ -89,13 +89,6 @@ def shard_of(folder: Path, count: int) -> Path:
             buffer.seek(0)
             tar.addfile(info, buffer)
     return path
-
-
-def seconds(work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    """How long it takes by the clock on the wall; ``time.process_time`` says how much of the processor."""
-    began = clock()
-    work()
-    return clock() - began
 
 
 def measure_speed(

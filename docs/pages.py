@@ -202,6 +202,16 @@ def shares(found: Any) -> Iterator[list[str]]:
         yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}", speeds]
 
 
+def compiled(found: Any) -> Iterator[list[str]]:
+    yield ["step, batch 16", "CPU ms", "compiled, CPU ms", "ratio", "least to most", "compiling, CPU s"]
+    for row in found["rows"]:
+        extras = ", bfloat16" if row["precision"] == "bf16-mixed" else ""
+        spread = f"{row['least']:.2f} to {row['most']:.2f}"
+        times = f"{row['eager_ms']:,.0f}", f"{row['compiled_ms']:,.0f}"
+        what = f"`{row['preset']}`, {row['size']} px{extras}"
+        yield [what, *times, f"{row['ratio']:.2f}", spread, f"{row['compiling_cpu_s']:.0f}"]
+
+
 def fitting(found: Any) -> Iterator[list[str]]:
     yield [f"{found['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
     before = 1000 * found["fit"]["portions_of_4_s"] / found["images"]
@@ -375,6 +385,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "million": ("clustering_million.json", million),
     "true-factors": ("true-factors.json", true_factors),
     "bench": ("bench.json", shares),
+    "compiled-step": ("compiled_step.json", compiled),
     "fitting": ("fitting.json", fitting),
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
     "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),

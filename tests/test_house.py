@@ -36,7 +36,7 @@ BUDGET = {  # lines, files
     "learn": (1_230, 6),
 }
 TOTAL = (41_890, 260)  # heads that turn hide their far side; on the way to (37_000, 270)
-TEST_LINES = 26_000
+TEST_LINES = 26_020  # an index of cells is tested; on the way back to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

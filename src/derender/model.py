@@ -111,9 +111,9 @@ class Derenderer(EmbeddingModel, Shareable):
 
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
         """The scene that codes stand for."""
-        raw = {f: self.nets[f.name].decode(codes[f.name]) for f in self.factors}  # type: ignore[operator]
-        ranges = self.settings.ranges
-        return Scene.from_parameters({f.parameter: f.to_parameter(raw[f], ranges) for f in self.factors})
+        nets, ranges = dict(self.nets.items()), self.settings.ranges
+        raw = {f.name: nets[f.name].decode(codes[f.name]) for f in self.factors}  # type: ignore[operator]
+        return Scene.from_parameters({f.parameter: f.to_parameter(raw[f.name], ranges) for f in self.factors})
 
     def decompose(self, images: GivenImages) -> Scene:
         """The scenes of images, (N, 3, S, S) in 0..1 or what `as_batch` takes."""

@@ -22,21 +22,35 @@ def table(tmp_path, monkeypatch):
     return made
 
 
-def run(tool: str) -> dict[str, Any]:
+def run(tool: str, call: str, storage: str = "Flat") -> dict[str, Any]:
     pytest.importorskip(tool, reason=f"needs pip install {tool}")
-    (block,) = [one for one in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if tool in one]
+    (block,) = [one for one in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if call in one]
     names: dict[str, Any] = {}
-    exec(block.replace("duckdb.sql", "found = duckdb.sql"), names)
+    exec(block.replace("duckdb.sql", "found = duckdb.sql").replace("128,Flat", f"128,{storage}"), names)
     return names
 
 
 def test_duckdb_counts_the_rows_of_each_kind(table):
-    assert sorted(run("duckdb")["found"].fetchall()) == [("jeep", 30), ("sports", 10)]
+    assert sorted(run("duckdb", "duckdb.sql")["found"].fetchall()) == [("jeep", 30), ("sports", 10)]
 
 
 def test_faiss_finds_the_rows_that_search_finds(table):
-    names = run("faiss")
+    names = run("faiss", "IndexFlatIP")
     for row, (similarity, nearest) in enumerate(zip(names["similarity"], names["neighbours"], strict=True)):
         found = search(table, table.files[row], factor="geometry", k=9)
         assert list(nearest) == [row, *found.rows]
         np.testing.assert_allclose(similarity[1:], 1 - np.array(found.distances), atol=1e-6)
+
+
+@pytest.mark.parametrize("storage", ["Flat", "SQ8"])
+def test_an_index_of_cells_finds_the_exact_neighbours(tmp_path, monkeypatch, storage):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    centres = rng.normal(size=(200, 24))[rng.integers(200, size=20_000)]
+    rows = np.maximum((centres + rng.normal(size=(20_000, 24))) @ rng.normal(size=(24, 64)), 0)
+    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    files = tuple(f"{row}.png" for row in range(20_000))
+    FeatureTable(files, {"geometry": rows}, {}).write("features.parquet")
+    found = run("faiss", "IVF128,Flat", storage)["neighbours"]
+    exact = np.argsort(-rows[:200] @ rows.T, axis=1)[:, :10]
+    assert np.mean([len(np.intersect1d(*pair)) for pair in zip(found, exact, strict=True)]) > 9.5

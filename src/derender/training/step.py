@@ -143,7 +143,8 @@ def perturb_one_factor(
     of the model that can be perturbed.
     """
     factors = loocc_factors(objective.loocc, model.factors)
-    indices = [model.factors.index(factor) for factor in factors]
+    names = [factor.name for factor in model.factors]
+    indices = [names.index(factor.name) for factor in factors]
     chosen = ranks.own(choose_factors(len(scene) * ranks.count, indices, generator))
     chosen = chosen.to(scene.depth.device, non_blocking=True)
     changed = {}
