@@ -4,12 +4,12 @@ A model sees 64 or 128 pixels; a photograph has more. Geometry and light vary sl
 coarse grid and enlarged: where each point of the new image lies in the photograph, and by how much its
 shading changes. The photograph is looked up there at its own resolution. Its own light and viewpoint give it
 back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
-model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface continues
-into a plane through the object's centre: hair, neck and background follow and come to rest.
-The more shading changes, the more the model's colours weigh: what it explained wrongly would otherwise stay
-in the surface. Shading multiplies coded (sRGB) values, as in training: on Extended Yale B that is nearer to
-the truth than the same ratio in linear light. Highlights and haze that the renderer knows are taken off and
-drawn anew; what they cannot explain stays.
+model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface
+continues into a plane through the object's centre: hair, neck and background follow and come to rest.
+The more shading or view change, the more the model's colours weigh: what it explained wrongly would otherwise
+stay in the surface. Shading multiplies coded (sRGB) values, as in training: on Extended Yale B that is nearer
+to the truth than the same ratio in linear light. Highlights and haze that the renderer knows are taken off
+and drawn anew; what they cannot explain stays.
 """
 
 from math import atan, degrees, radians, tan
@@ -32,7 +32,7 @@ FACING = (0.20, 0.45)  # cosine between surface and ray: below, a photograph tel
 MOVED = (0.01, 0.03)  # shares of the side: if nothing moves more than the first, all is the photograph's
 LIT = (0.10, 0.25)  # shading, as FACING
 LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
-DISTRUST = 4.0  # the weight of the photograph's detail is 1 / (1 + DISTRUST m²), m the mean squared log ratio
+DISTRUST = 4.0  # detail weighs 1 / (1 + DISTRUST (m² + d²)): mean squared log ratio, most shift in half sides
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
 FEATHER_SHARE = 1 / 20  # width of the blends, of the image's width
 COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
@@ -104,7 +104,8 @@ class PhotoDetail:
         mirror_seen = inside * (1 - seen) * mirrored[:, 2:3]
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         change = (ratio.log().square() * inside).sum(dim=(2, 3)) / inside.sum(dim=(2, 3)).clamp(min=1)
-        trust = 1 - inside * (1 - 1 / (1 + DISTRUST * change.square()))[:, :, None, None]
+        change = change[:, :, None, None].square() + (2 * moved).square()
+        trust = 1 - inside * (1 - 1 / (1 + DISTRUST * change))
         shift = _filled(shift * covered, covered) * self._inward().to(shift)
         veils = (inside * one for one in (own[:, 4:], mirrored[:, 4:], veil))
         faded, drawn = self._faded(ratio, inside), colours * shading
