@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_750, 16),
     "features": (1_460, 8),
     "interpretation": (1_190, 5),
-    "photo": (1_425, 7),  # heads that turn hide their far side
+    "photo": (1_430, 7),  # heads that turn hide their far side
     "networks": (740, 5),
     "storage": (970, 8),
     "objectives": (740, 6),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (680, 8),
     "learn": (1_230, 6),
 }
-TOTAL = (41_890, 260)  # heads that turn hide their far side; on the way to (37_000, 270)
-TEST_LINES = 26_020  # an index of cells is tested; on the way back to 26_000
+TOTAL = (41_895, 260)  # heads that turn hide their far side; on the way to (37_000, 270)
+TEST_LINES = 26_030  # an index of cells, turns there and back; on the way back to 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "gathered.py", "options.py", "scoring.py"}

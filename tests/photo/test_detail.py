@@ -81,6 +81,16 @@ def test_a_head_that_turns_hides_its_far_side(degrees):
     assert (seen - drawn[1]).square().mean() < 0.4 * (drawn[0] - drawn[1]).square().mean()
 
 
+def test_turned_there_and_back_it_is_the_photograph():
+    scene = bump(camera=(0.0,) * 6)
+    photo = textured(scene)
+    turned = scene.with_parameters(camera=torch.tensor([[0.0, math.radians(12), 0, 0, 0, 0]]))
+    there = PhotoDetail(photo, scene, FOV)(turned).image[0]
+    back = PhotoDetail(there, turned, FOV)(scene).image[0]
+    middle = (slice(None), slice(LARGE // 4, -LARGE // 4), slice(LARGE // 4, -LARGE // 4))
+    assert (back - photo)[middle].abs().mean() < 0.4 * (there - photo)[middle].abs().mean()
+
+
 def test_a_photograph_in_the_mirror_is_drawn_in_the_mirror():
     scene = bump()
     photo = textured(scene)

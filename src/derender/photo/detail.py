@@ -99,7 +99,7 @@ class PhotoDetail:
         covered = view.mask[:, None]
         place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
-        moved = (inside * shift.norm(dim=1, keepdim=True)).amax(dim=(2, 3), keepdim=True) / self.grid
+        moved = (inside * shift)[..., ::4, ::4].norm(dim=1).amax(dim=(1, 2))[:, None, None, None] / self.grid
         seen = 1 - inside * (1 - torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED)))
         mirror_seen = inside * (1 - seen) * mirrored[:, 2:3]
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
@@ -164,15 +164,18 @@ class PhotoDetail:
         Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
         model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
         """
-        trust = trust.expand(-1, -1, *fields[0].shape[-2:])
-        channels = [*(field.shape[1] for field in fields), 1]
-        *enlarged, trust = self._enlarged(torch.cat((*fields, trust), dim=1)).split(channels, dim=1)
-        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = enlarged
+        shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = fields
+        trust = trust.expand_as(seen)
+        shown = self._all_enlarged(shift, ratio, drawn, trust, seen, veil, new)
+        shift, ratio, drawn, trust, seen, veil, new = shown
         drawn = drawn.clamp(DARKEST, 1)
         image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
-        if bool((seen < 1).any()):
-            other = self._detailed(mirror_shift, mirror_ratio, drawn, trust, mirror_veil, new)
-            image = image + mirror_seen * other + (1 - seen - mirror_seen) * _veiled(drawn, new)
+        if bool((seen < 0.999).any()):
+            shift, ratio, weight, veil = self._all_enlarged(
+                mirror_shift, mirror_ratio, mirror_seen, mirror_veil
+            )
+            other = self._detailed(shift, ratio, drawn, trust, veil, new)
+            image = image + weight * other + (1 - seen - weight) * _veiled(drawn, new)
         return image.clamp(0, 1)
 
     def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, *veils: Tensor) -> Tensor:
@@ -185,8 +188,11 @@ class PhotoDetail:
         found = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
         clear = _cleared(found, veil)
         kept = clear.clamp(0, 1) if veil.shape[1] else clear
-        surface = (kept * ratio).clamp(DARKEST, 1) ** trust * drawn ** (1 - trust)
+        surface = torch.lerp(drawn.log(), (kept * ratio).clamp(DARKEST, 1).log(), trust).exp()
         return _veiled(surface, new) + _veiled(clear, veil) - _veiled(kept, veil)
+
+    def _all_enlarged(self, *fields: Tensor) -> tuple[Tensor, ...]:
+        return self._enlarged(torch.cat(fields, dim=1)).split([field.shape[1] for field in fields], dim=1)
 
     def _enlarged(self, fields: Tensor) -> Tensor:
         """Fields of the wide grid at the photograph's pixels."""

@@ -126,7 +126,7 @@ class Frame:
         pasted = photo.copy()
         region = torch.from_numpy(photo[top:bottom, left:right].astype(np.float32) / 255).permute(2, 0, 1)
         if moved:
-            gone = (max_pool2d(added.abs().amax(dim=1), 5, stride=1, padding=2) / GONE).clamp(0, 1)
+            gone = (max_pool2d(added.abs().amax(dim=1), 3, stride=1, padding=1) / GONE).clamp(0, 1)
             added = added + gone * (old - region)
         edited = (255 * (region + added[0])).round().clamp(0, 255)
         pasted[top:bottom, left:right] = edited.permute(1, 2, 0).to(torch.uint8).numpy()
