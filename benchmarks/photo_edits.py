@@ -202,7 +202,7 @@ def main() -> None:
     options.add_argument("--yale", type=Path, help="the cropped Extended Yale B, folder or zip")
     options.add_argument("--half", choices=("first", "second"), default="second", help="of the people")
     options.add_argument("--heads", type=int, default=40, help="number of generated heads")
-    options.add_argument("--seed", type=int, default=1_000)
+    options.add_argument("--seed", type=int, default=5_000, help="1000 and 3000 were used to choose settings")
     chosen = options.parse_args()
     with torch.inference_mode():
         result: dict = {"seed": chosen.seed, "heads": chosen.heads, "half": chosen.half}
