@@ -6,6 +6,7 @@ shading changes. The photograph is looked up there at its own resolution. Its ow
 back. A point that it does not show is taken from its mirror image where that is seen. Elsewhere it is the
 model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface
 continues into a plane through the object's centre: hair, neck and background follow and come to rest.
+New light falls on the object alone, whose outline GrabCut (Rother et al., SIGGRAPH 2004) finds by colour.
 The more shading or view change, the more the model's colours weigh: what it explained wrongly would otherwise
 stay in the surface. Shading multiplies coded (sRGB) values, as in training: on Extended Yale B that is nearer
 to the truth than the same ratio in linear light. Highlights and haze that the renderer knows are taken off
@@ -14,6 +15,8 @@ and drawn anew; what they cannot explain stays.
 
 from math import atan, degrees, radians, tan
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -40,6 +43,10 @@ COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carri
 RIM_SHARE = 0.04  # of the side: the rim of the model's maps, where depth ends in a wall
 REACH_SHARE = 1 / 4  # of the side: how far the surface goes on around them, at least
 FADE_SHARE = 1 / 8  # reach of new shading around them
+SURE, LIKELY = (
+    0.65,
+    (0.8, 0.6),
+)  # half sides: radius that is the object; radius, column where it starts to grow
 DARKEST = 1e-3
 LAMBERT = Renderer("lambert")
 
@@ -77,7 +84,7 @@ class PhotoDetail:
         self.renderer = renderer
         self._shading, self._veil = self._light(own), renderer.veil(own, self.wide_fov)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
-        self._colours = self._completed(own)
+        self._colours, self._object = self._completed(own), self._found_object(own)
         at_home = self._warped(self._place, own)
         off = (at_home.image - self._pixels()) * at_home.mask[:, None]
         self._off = off * (off.norm(dim=1, keepdim=True) < 1)  # what rounding leaves; more is hidden surface
@@ -89,7 +96,7 @@ class PhotoDetail:
         """
         scene = self._widened(scene)
         count, shading, veil = len(scene), self._light(scene), self.renderer.veil(scene, self.wide_fov)
-        own = torch.cat((self._place, self._seen, self._shading, self._veil), dim=1)
+        own = torch.cat((self._place, self._seen, self._shading, self._veil, self._object), dim=1)
         edge = -RIM_SHARE - FEATHER_SHARE / 2
         reach = self._around(edge - FEATHER_SHARE, edge)
         maps = torch.cat((own, own.flip(-1), self._colours, reach), dim=1).expand(count, -1, -1, -1)
@@ -105,10 +112,11 @@ class PhotoDetail:
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         change = (ratio.log().square() * inside).sum(dim=(2, 3)) / inside.sum(dim=(2, 3)).clamp(min=1)
         change = change[:, :, None, None].square() + (2 * moved).square()
-        trust = 1 - inside * (1 - 1 / (1 + DISTRUST * change))
+        lit = own[:, -1:]
+        trust = 1 - inside * lit * (1 - 1 / (1 + DISTRUST * change))
         shift = _filled(shift * covered, covered) * self._inward().to(shift)
-        veils = (inside * one for one in (own[:, 4:], mirrored[:, 4:], veil))
-        faded, drawn = self._faded(ratio, inside), colours * shading
+        veils = (inside * one for one in (own[:, 4:-1], mirrored[:, 4:-1], veil))
+        faded, drawn = self._faded(ratio, inside) ** lit, colours * shading
         fields = (shift, mirror_shift, seen, mirror_seen, faded, mirror_ratio, drawn, *veils)
         image, depth = self._composed(fields, trust), self._enlarged(view.depth[:, None])[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
@@ -201,12 +209,14 @@ class PhotoDetail:
         centres = _square(across * 2 / (self.wide - 1)).to(fields).expand(len(fields), -1, -1, -1)
         return grid_sample(fields, centres, padding_mode="border", align_corners=True)
 
-    def on_grid(self, image: Float[Tensor, "1 3 s s"], size: int) -> Float[Tensor, "1 3 size size"]:
-        """What covers the photograph, on a grid from the model's first to its last pixel centre."""
-        side = round(size * self.span)
+    def on_grid(
+        self, image: Float[Tensor, "1 3 s s"], size: int, spread: float = 1.0
+    ) -> Float[Tensor, "1 3 size size"]:
+        """What covers the photograph, on a grid ``spread`` times as wide as from the model's first to last pixel."""
+        side = round(size * self.span / spread)
         if side < image.shape[-1]:
             image = interpolate(image, (side, side), mode="bilinear", antialias=True)
-        edge = (1 - 1 / self.model_size) / self.span
+        edge = spread * (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
         found = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
         return found.clamp(0, 1)
@@ -234,6 +244,24 @@ class PhotoDetail:
         return avg_pool2d(
             _eroded(share, reach), 2 * reach + 1, stride=1, padding=reach, count_include_pad=False
         )
+
+    def _found_object(self, own: Scene) -> Float[Tensor, "1 1 w w"]:
+        """How surely each canonical point is the object and not what is behind it, 0..1."""
+        size = self.wide // 2
+        photo = self.on_grid(self.photo[None], size, (self.wide - 1) / (self.grid - 1))
+        pixels = np.ascontiguousarray((255 * photo[0]).byte().permute(1, 2, 0).cpu().numpy())
+        across = (torch.arange(self.wide) - (self.wide - 1) / 2).to(photo) / (self.grid / 2)
+        radius, column = torch.hypot(across, across[:, None]), across.abs().expand(self.wide, -1)
+        start = torch.stack((radius < SURE, (radius < LIKELY[0]) | (column < LIKELY[1])))[None].to(photo)
+        sure, likely = (interpolate(self._warped(start, own).image, (size, size)) > 0.5)[0].cpu().numpy()
+        labels = np.select((sure, likely), (cv2.GC_FGD, cv2.GC_PR_FGD), cv2.GC_PR_BGD).astype(np.uint8)
+        if sure.any() and not likely.all():
+            cv2.setRNGSeed(0)
+            mixtures = np.zeros((2, 1, 65))
+            cv2.grabCut(pixels, labels, None, *mixtures, 3, cv2.GC_INIT_WITH_MASK)
+        found = torch.from_numpy(labels & 1).to(photo)[None, None]
+        found = _ramp(avg_pool2d(found, 5, stride=1, padding=2, count_include_pad=False), 0.3, 0.8)
+        return _look_up(interpolate(found, (self.wide,) * 2, mode="bilinear"), self._place)
 
     def _pixels(self) -> Float[Tensor, "1 2 g g"]:
         return _square(torch.arange(self.wide).float()).permute(0, 3, 1, 2).to(self.photo)

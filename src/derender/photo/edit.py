@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -33,6 +33,9 @@ AMBIENT_SHARE = 0.35
 
 LARGEST_CROP = 1024
 """Side of the largest crop that is drawn pixel by pixel; of larger ones the change is enlarged."""
+
+FIT_STEPS = 20
+"""Steps that optimise a scene before it is edited, if the model can; further ones gain little."""
 
 MARGIN = 0.35
 """How far edits reach beyond the frame, in shares of its side."""
@@ -115,7 +118,11 @@ class Photograph:
 
 
 def open_photograph(
-    pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, *, frame: str | None = None, fit_steps: int = 0
+    pixels: UInt8[np.ndarray, "h w 3"],
+    model: Derenderer,
+    *,
+    frame: str | None = None,
+    fit_steps: int | None = None,
 ) -> Photograph:
     """Find the part that suits the model, and decompose it.
 
@@ -123,19 +130,25 @@ def open_photograph(
         pixels: the photograph.
         model: trained.
         frame: as `found_frame` takes it.
-        fit_steps: Adam steps that fit the scene to the photograph; 0 takes the networks' answer.
+        fit_steps: as `editable_scenes` takes them.
     """
     place = found_frame(pixels, model, frame)[0]
     own = model.image_size
     small = torch.from_numpy(place.cut(pixels, own)[None]).to(model.device).float() / 255
-    scene = model.fit_scenes(small, fit_steps).scene if fit_steps else model.decompose(small)
-    return Photograph.of(pixels, place, scene, model)
+    return Photograph.of(pixels, place, editable_scenes(model, small, fit_steps), model)
+
+
+def editable_scenes(model: Derenderer, images: Float[Tensor, "n 3 h w"], steps: int | None = None) -> Scene:
+    """Scenes of images, optimised in ``steps``: None are ``FIT_STEPS`` if the model can, 0 its feed-forward."""
+    if steps is None:
+        steps = FIT_STEPS if model.fitting is not None else 0
+    return model.fit_scenes(images, steps).scene if steps else model.decompose(images)
 
 
 def relight(
     image: GivenImages, model: Derenderer | str | Path = "faces-64", *, yaw_deg: float = 50.0,
     pitch_deg: float = 10.0, strength: float = 1.0, like: GivenImages | None = None,
-    frame: str | None = None, fit_steps: int = 0,
+    frame: str | None = None, fit_steps: int | None = None,
 ) -> Any:  # fmt: skip
     """A photograph under another light.
 
@@ -169,7 +182,7 @@ def relight(
 
 def rotate(
     image: GivenImages, model: Derenderer | str | Path = "faces-64", *, yaw_deg: float = 20.0,
-    pitch_deg: float = 0.0, frame: str | None = None, fit_steps: int = 0,
+    pitch_deg: float = 0.0, frame: str | None = None, fit_steps: int | None = None,
 ) -> Any:  # fmt: skip
     """A photograph whose object is turned from where it looks, in its own light.
 

@@ -166,6 +166,7 @@ class Fitting(nn.Module):
             write_tensors(dict(self.named_buffers()), temporary, told)
 
     @classmethod
+    @torch.inference_mode(False)  # its maps take part in gradients
     def load(cls, file: Path, image_size: int | None = None) -> "Fitting":
         """Read what ``save`` wrote; damage, or maps of another side than ``image_size``, is a ValueError."""
         tensors, metadata = read_described(file)
