@@ -67,6 +67,21 @@ def test_new_light_is_nearer_to_the_truth_than_the_photograph():
     assert (seen - truth)[mask].abs().mean() < 0.3 * (photo - truth)[mask].abs().mean()
 
 
+def test_new_light_leaves_what_is_behind_the_object():
+    light, view = LIGHTS["frontal"].model_copy(update={"yaw_deg": (0, 0)}), VIEWS["frontal"]
+    settings = FaceSettings(light=light, view=view, backgrounds=("plain",))
+    head = faces.generate(1, 128, 4, settings)
+    photo, object_mask = torch.from_numpy(head.images[0]) / 255, torch.from_numpy(head.mask[0] > 0)
+    model = load("rendered-faces-64")
+    scene = model.decompose(avg_pool2d(photo[None], 2))
+    other = scene.with_parameters(light=torch.tensor([[0.2, 1.0, 0.0, 1.2]]))
+    change = (PhotoDetail(photo, scene, model.fov_deg)(other).image[0] - photo).abs().mean(dim=0)
+    near = object_mask[None].float()
+    behind = avg_pool2d(near, 5, stride=1, padding=2)[0] == 0
+    assert change[behind].mean() < 0.01
+    assert change[object_mask].mean() > 0.05
+
+
 @pytest.mark.parametrize("degrees", [-30, 30])
 def test_a_head_that_turns_hides_its_far_side(degrees):
     light, view = LIGHTS["frontal"].model_copy(update={"yaw_deg": (0, 0)}), VIEWS["frontal"]

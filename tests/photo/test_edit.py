@@ -7,8 +7,10 @@ from PIL import Image
 from tests.photo.test_align import scene
 
 import derender
-from derender.photo import Frame, find_faces, found_frame
+from derender.photo import Frame, find_faces, found_frame, open_photograph
+from derender.photo.edit import FIT_STEPS
 from derender.photo.faces import RENDERED, frame_of
+from derender.postprocess import Features
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +56,17 @@ def test_edits_change_the_face_and_leave_the_rest(photo, model):
         change = np.abs(np.asarray(after).astype(int) - before).max(axis=-1)
         assert change[150:270, 220:340].mean() > 3
         assert (change[:, 560:] == 0).all() and (change[440:] == 0).all()
+
+
+def test_scenes_are_optimised_before_they_are_edited(photo, model):
+    def light(steps: int | None = None) -> torch.Tensor:
+        return open_photograph(np.asarray(photo), model, fit_steps=steps).scene.light
+
+    assert torch.equal(light(), light(FIT_STEPS))
+    assert not torch.equal(light(), light(0))
+    unable = model.with_features(Features(model.whitening))
+    assert model.fitting is not None and unable.fitting is None
+    assert torch.equal(open_photograph(np.asarray(photo), unable).scene.light, light(0))
 
 
 def test_no_turn_and_its_own_light_return_the_photograph(photo, model):

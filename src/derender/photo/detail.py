@@ -212,7 +212,7 @@ class PhotoDetail:
     def on_grid(
         self, image: Float[Tensor, "1 3 s s"], size: int, spread: float = 1.0
     ) -> Float[Tensor, "1 3 size size"]:
-        """What covers the photograph, on a grid ``spread`` times as wide as from the model's first to last pixel."""
+        """What covers the photograph, on ``spread`` times the square of the model's pixel centres."""
         side = round(size * self.span / spread)
         if side < image.shape[-1]:
             image = interpolate(image, (side, side), mode="bilinear", antialias=True)
@@ -257,8 +257,8 @@ class PhotoDetail:
         labels = np.select((sure, likely), (cv2.GC_FGD, cv2.GC_PR_FGD), cv2.GC_PR_BGD).astype(np.uint8)
         if sure.any() and not likely.all():
             cv2.setRNGSeed(0)
-            mixtures = np.zeros((2, 1, 65))
-            cv2.grabCut(pixels, labels, None, *mixtures, 3, cv2.GC_INIT_WITH_MASK)
+            back, front = np.zeros((2, 1, 65))  # of GrabCut's own
+            cv2.grabCut(pixels, labels, (0, 0, 1, 1), back, front, 3, cv2.GC_INIT_WITH_MASK)
         found = torch.from_numpy(labels & 1).to(photo)[None, None]
         found = _ramp(avg_pool2d(found, 5, stride=1, padding=2, count_include_pad=False), 0.3, 0.8)
         return _look_up(interpolate(found, (self.wide,) * 2, mode="bilinear"), self._place)

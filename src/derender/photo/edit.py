@@ -139,7 +139,7 @@ def open_photograph(
 
 
 def editable_scenes(model: Derenderer, images: Float[Tensor, "n 3 h w"], steps: int | None = None) -> Scene:
-    """Scenes of images, optimised in ``steps``: None are ``FIT_STEPS`` if the model can, 0 its feed-forward."""
+    """Scenes of images, optimised in ``steps``: None are ``FIT_STEPS`` if the model can, 0 none."""
     if steps is None:
         steps = FIT_STEPS if model.fitting is not None else 0
     return model.fit_scenes(images, steps).scene if steps else model.decompose(images)
