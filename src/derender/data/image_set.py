@@ -272,17 +272,6 @@ def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) 
     return tensor.to(torch.float32) / 255
 
 
-def check_images(images: Tensor, size: int) -> None:
-    """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
-    if images.ndim != 4 or images.shape[1:] != (3, size, size):
-        raise ValueError(
-            f"this model takes images of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
-            f"read them with derender.data.read_images(..., image_size={size}) or resize them"
-        )
-    if not images.is_floating_point():
-        raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
-
-
 @dataclass
 class _Found:
     """What is known after each chunk: names, labels and partitions of the rows, and what is left out."""

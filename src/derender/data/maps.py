@@ -11,6 +11,7 @@ The set does not state this, and it is untested on the archive. Look at the aver
 unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
 """
 
+import io
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
-from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
+from derender.data.image import DECODER_ERRORS, fit_square, quiet_pillow, upright_size
 from derender.data.image_set import ImageSet, read_images
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
@@ -179,7 +180,7 @@ def _require_all(files: Source, layout: str, table: Table) -> None:
 
 def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
     """A mask that holds class numbers; a palette's colours do not matter."""
-    values = np.asarray(opened_image(source, file))
+    values = np.asarray(_opened(source, file))
     if values.ndim > 2:
         raise ValueError(
             f"{file} in {source.path} has {values.shape[2]} channels; a mask has one, of class numbers"
@@ -192,7 +193,7 @@ def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.n
 
 def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
     """The parts of one face, at least one, over one another, in the order of their class numbers."""
-    parts = {number: np.asarray(opened_image(source, files[number]).convert("L")) for number in sorted(files)}
+    parts = {number: np.asarray(_opened(source, files[number]).convert("L")) for number in sorted(files)}
     merged = np.zeros(next(iter(parts.values())).shape, np.uint8)
     for number, part in parts.items():
         if part.shape != merged.shape:
@@ -264,7 +265,7 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
         for name in names:
             if name not in known:
                 raise ValueError(f"{source.path} has no {name}, which other images have")
-            opened = opened_image(source, name)
+            opened = _opened(source, name)
             array = np.asarray(opened)
             if opened.mode not in modes or (arrays and array.shape != arrays[0].shape):
                 raise ValueError(
@@ -304,7 +305,7 @@ def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -
     images, depths, masks = [], [], []
     for file, map_file in pairs.items():
         depth, mask = _read_depth(source, map_file, image_size)
-        image = opened_image(source, file).convert("RGB")
+        image = _opened(source, file).convert("RGB")
         if image.width != image.height:
             raise ValueError(f"{file} in {source.path} is {image.size}: images with depth must be square")
         if image_size is not None:
@@ -330,7 +331,7 @@ def _read_depth(
     Maps are shrunk by area, over the object's pixels alone; a pixel is on the object where more than half of
     it is.
     """
-    opened = opened_image(source, file)
+    opened = _opened(source, file)
     mode, code = opened.mode, np.asarray(opened)
     if mode == "RGB" and (code == code[..., :1]).all():
         code = code[..., 0]
@@ -349,6 +350,16 @@ def _read_depth(
     )
     small = share > 0.5
     return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32), small
+
+
+def _opened(source: Source, file: str) -> Image.Image:
+    """A map or mask as it is stored, decoded; one that cannot be read is an error that names it."""
+    try:
+        opened = Image.open(io.BytesIO(source.read(file)))
+        opened.load()
+        return opened
+    except DECODER_ERRORS as problem:
+        raise ValueError(f"{file} in {source.path} cannot be read: {problem}") from problem
 
 
 def _channels_first(code: np.ndarray) -> np.ndarray:
