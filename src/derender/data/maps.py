@@ -23,9 +23,10 @@ from PIL import Image
 
 from derender.data.image import DECODER_ERRORS, fit_square, quiet_pillow, upright_size
 from derender.data.image_set import ImageSet, read_images
+from derender.data.layouts import layout_named
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
-from derender.data.layouts.rendered import CAMERA, DEPTH_PAIRS, LIGHT, SYNFACE, pairs_of, rendered_folders
+from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
 from derender.data.opening import list_images, open_source, parse_source
 from derender.data.source import Source
 from derender.data.stream import Progress, usable_cores
@@ -155,7 +156,7 @@ def read_ground_truth(
     place, named, options = parse_source(source)
     with open_source(Path(place).expanduser()) as opened:
         pairs = {} if rendered_folders(opened) else pairs_of(opened)
-        layout = DEPTH_PAIRS if pairs else SYNFACE
+        layout = layout_named("depth_pairs" if pairs else "synface")
         table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
         table = half_of(table, options.get("half", "all"))
         if pairs:
