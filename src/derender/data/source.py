@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -38,7 +38,23 @@ class Skipped:
     reason: str
 
 
-class Source(ABC):
+C = TypeVar("C", bound="Closing")
+
+
+class Closing:
+    """What may hold files open until it is closed, or left as a context."""
+
+    def close(self) -> None:
+        """Release what is held open."""
+
+    def __enter__(self: C) -> C:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class Source(Closing, ABC):
     """Named files, read by name."""
 
     path: Path  # the folder or file that the user named
@@ -56,15 +72,6 @@ class Source(ABC):
     def size(self, file: str) -> int:
         """The bytes of one file, unpacked."""
         return int(self.stamps((file,))[0, 0])
-
-    def close(self) -> None:  # noqa: B027  (folders hold nothing open)
-        """Release what the source holds open."""
-
-    def __enter__(self) -> "Source":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     @cached_property
     def images(self) -> tuple[str, ...]:
