@@ -12,9 +12,10 @@ unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
 """
 
 import io
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,10 +109,16 @@ def read_masks(
     limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
     with files:
         if listed is not None:
-            _require_all(files, listed.layout, listed.table)
+            if "mask" not in listed.table.labels:
+                raise ValueError(
+                    f"{files.path} holds no masks (it was read as {listed.layout}): expected images/NAME.jpg "
+                    "with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
+                )
+            _require_masks(files, listed.table.files, listed.table.labels["mask"].tolist())
         how = {"dataset": dataset, "subset": subset, "fit": fit, "workers": workers, "progress": progress}
         images = read_images(source, image_size, **how, **reading)
         names = images.label("mask").tolist() if own else _named_alike(files, images.files)
+        _require_masks(files, images.files, names)
         parts = parts_of(files) if own else {}
         found = np.empty((len(images), image_size, image_size), np.uint8)
 
@@ -164,18 +171,12 @@ def read_ground_truth(
         return _read_maps(opened, table, limit)
 
 
-def _require_all(files: Source, layout: str, table: Table) -> None:
-    """Every image has a mask, or an error says how many have none."""
-    if "mask" not in table.labels:
+def _require_masks(source: Source, images: Sequence[str], masks: Sequence[str]) -> None:
+    """Every image has a mask in the source, or an error says how many have none."""
+    if bare := [image for image, mask in zip(images, masks, strict=True) if not mask]:
         raise ValueError(
-            f"{files.path} holds no masks (it was read as {layout}): expected images/NAME.jpg with "
-            f"masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
-        )
-    bare = [file for file, mask in zip(table.files, table.labels["mask"], strict=True) if not mask]
-    if bare:
-        raise ValueError(
-            f"{len(bare):,} of {len(table.files):,} images in {files.path} have no mask, the first is "
-            f"{bare[0]!r}; add the masks or take these images out"
+            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
+            f"{bare[0]!r}; add the masks (NAME.png for NAME.jpg), or take these images out"
         )
 
 
@@ -214,11 +215,6 @@ def _named_alike(source: Source, images: tuple[str, ...]) -> list[str]:
     for image in images:
         alike = by_stem.get(stem_of(image), [])
         names.append(by_path.get(image.rpartition(".")[0]) or (alike[0] if len(alike) == 1 else ""))
-    if bare := [image for image, name in zip(images, names, strict=True) if not name]:
-        raise ValueError(
-            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
-            f"{bare[0]!r}: expected {PurePosixPath(bare[0]).with_suffix('.png')} there"
-        )
     return names
 
 
@@ -303,9 +299,9 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
 
 def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -> GroundTruth:
     """Images beside depth maps: neither normals nor albedo, light and camera are known."""
-    images, depths, masks = [], [], []
+    images, depths = [], []
     for file, map_file in pairs.items():
-        depth, mask = _read_depth(source, map_file, image_size)
+        depth = _read_depth(source, map_file, image_size)
         image = _opened(source, file).convert("RGB")
         if image.width != image.height:
             raise ValueError(f"{file} in {source.path} is {image.size}: images with depth must be square")
@@ -318,16 +314,14 @@ def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -
             )
         images.append(np.asarray(image))
         depths.append(depth)
-        masks.append(mask)
+    depth = np.stack(depths)
     nothing = dict.fromkeys(("normal", "albedo", "light", "camera"))
-    exact = {"depth": np.stack(depths), "mask": np.stack(masks)}
-    return GroundTruth(_channels_first(np.stack(images)), **exact, **nothing, files=tuple(pairs), labels={})
+    exact = {"images": _channels_first(np.stack(images)), "depth": depth, "mask": depth > 0}
+    return GroundTruth(**exact, **nothing, files=tuple(pairs), labels={})
 
 
-def _read_depth(
-    source: Source, file: str, size: int | None
-) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """One depth map, z with 0 for background, and where the object is; at ``size`` if given.
+def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarray, "h w"]:
+    """One depth map, z with 0 for background; at ``size`` if given.
 
     Maps are shrunk by area, over the object's pixels alone; a pixel is on the object where more than half of
     it is.
@@ -344,13 +338,13 @@ def _read_depth(
     nearness = code / (255 if code.dtype == np.uint8 else 65_535)
     depth = np.where(mask, far - (far - near) * nearness, 0).astype(np.float32)
     if size is None or depth.shape == (size, size):
-        return depth, mask
+        return depth
     by_area, share = (
         np.asarray(Image.fromarray(one.astype(np.float32)).resize((size, size), Image.Resampling.BOX))
         for one in (depth, mask)
     )
     small = share > 0.5
-    return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32), small
+    return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32)
 
 
 def _opened(source: Source, file: str) -> Image.Image:
