@@ -48,11 +48,6 @@ def as_model(
     return loaded
 
 
-def require_fitting(model: Derenderer, source: str = "this model") -> None:
-    """Raise ValueError where a model lacks the morphable maps that test-time optimisation needs."""
-    model.features.required_fitting(source)
-
-
 def as_images(
     images: ImageSet | str | Path, image_size: int, *, dataset: str = "auto", limit: int | None = None,
     part: str = "all", model: str | Path | None = None, at_least: int = 1, keep_duplicates: bool = False,

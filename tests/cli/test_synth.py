@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.cli.conftest import run
 
-from derender.data.synthetic import benchmark
+from derender.data import synthetic
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +97,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(folder, capsys, kind, argument
 def test_the_benchmark_has_fixed_sets_of_different_people(kind, folder, monkeypatch):
     small = {
         name: replace(part, count=48 if name == "tracks" else 16)
-        for name, part in benchmark.PARTS[kind].items()
+        for name, part in synthetic.PARTS[kind].items()
     }
-    monkeypatch.setitem(benchmark.PARTS, kind, small)
+    monkeypatch.setitem(synthetic.PARTS, kind, small)
     assert run("synth", kind, "--benchmark", "--out", folder / f"all-{kind}", "--image-size", 16) == 0
     tables = {}
     for name, part in small.items():
@@ -109,6 +109,6 @@ def test_the_benchmark_has_fixed_sets_of_different_people(kind, folder, monkeypa
         assert (folder / f"all-{kind}" / name / "depth").exists() == (name == "test")
     assert len({rows[0]["lx"] for rows in tables.values()}) == len(tables)  # no draw is that of another part
     if kind == "cars":
-        assert {row["class"] for row in tables["test"]} <= {*benchmark.FIVE_CLASSES[9:-1].split(",")}
+        assert {row["class"] for row in tables["test"]} <= {*synthetic.FIVE_CLASSES[9:-1].split(",")}
     else:
         assert (folder / "all-faces" / "tracks" / "tracks" / "id0000" / "track_007" / "005.jpg").exists()

@@ -299,7 +299,7 @@ def test_missing_masks_images_and_lines_are_named(tree, published, merged):
     source = tree({**merged, "images/9.jpg": picture(9)})
     with list_images(source, dataset="celebamask") as listed:
         assert listed.table.labels["mask"].tolist() == [*(f"masks/{row}.png" for row in range(3)), ""]
-    with pytest.raises(ValueError, match=r"1 of 4 images in .* have no mask, the first is 'images/9\.jpg'"):
+    with pytest.raises(ValueError, match=r"1 of 4 images have no mask in .*, the first is 'images/9\.jpg'"):
         read_masks(source, 8, dataset="celebamask")
     nose = "CelebAMask-HQ/CelebAMask-HQ-mask-anno/0/00000_nose.png"
     two_sizes = {**published, nose: part(slice(0), slice(0), 12)}

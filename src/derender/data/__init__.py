@@ -4,21 +4,31 @@ opening       from what the user wrote to a stream of images: open_images; zip a
 source        named files; parquet files, their sizes checked before they are read
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another, decoded on every core; shards (WebDataset), huggingface
-image         decode one
+image         decode one; images as a caller has them
 image_set     a stream collected into an array: read_images; its split; cache: large sets in a memory map
 maps          images with masks, with exact depth, normals and albedo
 doctor/       whether a set of images suits the method
 """
 
 from derender.data.cache import cache_folder, sample_checksum
-from derender.data.given import GivenImages, as_batch, as_photos, read_photo
-from derender.data.image import READER_VERSION, Unreadable, decode, decode_whole, quiet_pillow, read_image
+from derender.data.image import (
+    READER_VERSION,
+    GivenImages,
+    Unreadable,
+    as_batch,
+    as_photos,
+    check_images,
+    decode,
+    decode_whole,
+    quiet_pillow,
+    read_image,
+    read_photo,
+)
 from derender.data.image_set import (
     Duplicate,
     ImageSet,
     Split,
     as_float,
-    check_images,
     read_images,
     split_indices,
 )

@@ -12,7 +12,7 @@ import os
 import sys
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from jaxtyping import UInt8
 from derender.storage.atomic import atomic_file
 
 _MARK = b"derender pictures 2\n"
-_SAMPLED_ROWS = 64
 _ABANDONED_SECONDS = 86_400
 
 
@@ -74,7 +73,8 @@ def write_cache(
     file: Path,
     fingerprint: str,
     image_size: int,
-    fill: Callable[[Callable[[np.ndarray], None]], dict[str, Any]],
+    chunks: Iterator[np.ndarray],
+    known: Callable[[], dict[str, Any]],
 ) -> None:
     """Make the file anew; one that cannot be written is an OSError that says what to do.
 
@@ -82,8 +82,8 @@ def write_cache(
         file: where.
         fingerprint: of what the rows are made from.
         image_size: side of the images in pixels.
-        fill: calls the function it is given with rows, (n, 3, S, S) uint8, any number of times. It returns
-            what is known of them; its "files" name the rows.
+        chunks: rows, (n, 3, S, S) uint8.
+        known: gives what is known of them after the last; its "files" name the rows.
     """
     written, storing = 0, True
     try:
@@ -92,18 +92,14 @@ def write_cache(
             if other.stat().st_mtime < time.time() - _ABANDONED_SECONDS:
                 other.unlink(missing_ok=True)
         with atomic_file(file, durable=True) as draft, draft.open("wb") as stream:
-
-            def append(rows: np.ndarray) -> None:
-                nonlocal written, storing
+            storing = False
+            for rows in chunks:
                 storing = True
                 stream.write(np.ascontiguousarray(rows).data)
                 written, storing = written + rows.nbytes, False
-
-            storing = False
-            content = fill(append)
             storing = True
             stream.flush()
-            shape = (len(content["files"]), 3, image_size, image_size)
+            shape = (len((content := known())["files"]), 3, image_size, image_size)
             checksum = sample_checksum(np.memmap(draft, np.uint8, mode="r", shape=shape))
             note = {"fingerprint": fingerprint, "checksum": checksum, "content": content}
             encoded = json.dumps(note).encode()
@@ -120,7 +116,7 @@ def write_cache(
 
 def sample_checksum(rows: np.ndarray) -> int:
     """CRC of at most 64 rows, evenly spaced, the first and the last among them."""
-    chosen = np.unique(np.linspace(0, len(rows) - 1, _SAMPLED_ROWS).astype(int)) if len(rows) else []
+    chosen = np.unique(np.linspace(0, len(rows) - 1, 64).astype(int)) if len(rows) else []
     checksum = 0
     for row in chosen:
         checksum = zlib.crc32(rows[row].tobytes(), checksum)

@@ -55,7 +55,11 @@ class HuggingFaceStream(Stream):
         self._options = (split, column, config)
         self._revision = revision if isinstance(place, Path) else _commit(place, revision)
         splits = _load(source, place, config, self._revision)
-        names = _chosen(list(splits), split, source)
+        part = split or ("train" if "train" in splits else next(iter(splits)) if len(splits) == 1 else "")
+        if part not in ("all", *splits):
+            hint = f"it has no split {part!r}{suggestion(part, splits)}" if part else "name one of its splits"
+            raise ValueError(f"{source}: {hint}; there are {', '.join(splits)}, and all of them as ::all")
+        names = list(splits) if part == "all" else [part]
         self._column, self._labels = _columns(splits[names[0]], column, source)
         self._counts = {name: _count(splits[name]) for name in names}
         self._splits: dict[str, Any] = {}
@@ -144,17 +148,6 @@ def _load(source: str, place: str | Path, config: str | None, revision: str | No
         raise ValueError(f"{source} cannot be read as a Hugging Face data set: {reason}{hint}") from problem
 
 
-def _chosen(splits: list[str], split: str | None, source: str) -> list[str]:
-    if split == "all":
-        return splits
-    if split is None:
-        split = "train" if "train" in splits else splits[0] if len(splits) == 1 else None
-    if split not in splits:
-        hint = f"it has no split {split!r}{suggestion(split, splits)}" if split else "name one of its splits"
-        raise ValueError(f"{source}: {hint}; there are {', '.join(splits)}, and all of them as ::all")
-    return [split]
-
-
 def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str, Any]]:
     """The image column, and the columns that are labels with their types."""
     import datasets
@@ -176,19 +169,18 @@ def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str,
         hint = suggestion(column, images)
         raise ValueError(f"{source} has no column of images {column!r}{hint}; there is {', '.join(images)}")
 
-    def is_label(feature: Any) -> bool:
-        plain = isinstance(feature, datasets.Value) and feature.dtype.startswith(_LABEL_KINDS)
-        return plain or isinstance(feature, datasets.ClassLabel)
-
-    return column or images[0], {name: one for name, one in features.items() if is_label(one)}
+    labels = {}
+    for name, one in features.items():
+        plain = isinstance(one, datasets.Value) and one.dtype.startswith(_LABEL_KINDS)
+        if plain or isinstance(one, datasets.ClassLabel):
+            labels[name] = one
+    return column or images[0], labels
 
 
 def _count(rows: Any) -> int | None:
     """The number of rows, where it is known without reading them."""
-    if hasattr(rows, "num_rows"):
-        return rows.num_rows
-    split = (rows.info.splits or {}).get(str(rows.split)) if rows.split is not None else None
-    return (split.num_examples or None) if split is not None else None
+    known = (rows.info.splits or {}).get(str(rows.split))
+    return getattr(rows, "num_rows", None) or getattr(known, "num_examples", None) or None
 
 
 def _read_path(path: str, place: str | Path) -> bytes:

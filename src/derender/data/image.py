@@ -1,4 +1,4 @@
-"""One encoded image in, one uint8 (3, S, S) array out.
+"""One encoded image in, one uint8 (3, S, S) array out; and images as a caller has them.
 
 Orientation from EXIF is applied; grey, palette and CMYK become RGB; transparent pixels are laid over white.
 16-bit images are scaled (65535 becomes 255), never clipped; of an animation the first frame is taken. Colour
@@ -8,6 +8,9 @@ on white ("pad"), squeezed ("stretch"), or given room ("room": their edge contin
 needed is decoded at a reduced scale. Images above ``PIXEL_LIMIT`` and damaged ones raise ``Unreadable``,
 nothing else. A box (left, top, right, bottom in pixels of the upright image) cuts out a part first. It is
 moved and shrunk as far as needed to lie inside the image.
+
+A caller gives a path, a Pillow image, a NumPy array, a tensor, or several of these. Arrays of bytes, or of
+numbers in 0..1, may be (H, W, 3), (3, H, W) or grey (H, W). Batches are (N, H, W, 3) or (N, 3, H, W).
 """
 
 import importlib
@@ -17,19 +20,24 @@ import struct
 import threading
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float32, UInt8
-from PIL import Image
+import torch
+from jaxtyping import Float, Float32, UInt8
+from PIL import ExifTags, Image
 from PIL.Image import Resampling, Transpose
+from torch import Tensor
 
-from derender.data.source import FILE_LIMIT_BYTES, Source
+from derender.data.source import FILE_LIMIT_BYTES
 from derender.storage.bounded import read_bounded
-from derender.storage.places import require_known
+from derender.storage.places import nearest_sibling, require_known
+
+GivenImages: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor | Sequence[Any]
 
 READER_VERSION = 1
 """Goes up whenever the same file would decode to other pixels, so that cached images are made again."""
@@ -46,7 +54,6 @@ one_large_image_at_a_time = threading.RLock()
 _FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM", "AVIF", "HEIF")
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _BACKGROUND = (255, 255, 255)
-_ORIENTATION_TAG = 0x0112
 _UPRIGHT = (  # by orientation, from 2 on
     *(Transpose.FLIP_LEFT_RIGHT, Transpose.ROTATE_180, Transpose.FLIP_TOP_BOTTOM, Transpose.TRANSPOSE),
     *(Transpose.ROTATE_270, Transpose.TRANSVERSE, Transpose.ROTATE_90),
@@ -141,8 +148,14 @@ def refuse_by_header(head: bytes, size: int) -> None:
 
 
 def upright_rgb(opened: Image.Image) -> Image.Image:
-    """An opened image as 8-bit RGB, turned as its EXIF orientation says."""
-    return upright(_as_rgb(opened), opened)
+    """An opened image of any of Pillow's modes as 8-bit RGB, turned as its EXIF orientation says."""
+    image = opened
+    if image.mode == "F" or image.mode.startswith("I"):
+        image = _from_high_depth(image)
+    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
+        layered = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", layered.size, (*_BACKGROUND, 255)), layered)
+    return _upright(image.convert("RGB"), opened)
 
 
 @contextmanager
@@ -186,12 +199,12 @@ def _cut(image: Image.Image, box: Float32[np.ndarray, "4"]) -> Image.Image:
     return image.crop((int(left), int(top), int(left + sides[0]), int(top + sides[1])))
 
 
-def upright(image: Image.Image, opened: Image.Image) -> Image.Image:
+def _upright(image: Image.Image, opened: Image.Image) -> Image.Image:
     """Turn the image as the EXIF orientation of the ``opened`` file says; damaged EXIF counts as none."""
     if opened.format == "JPEG" and "exif" not in opened.info and "xmp" not in opened.info:
         return image
     try:
-        orientation = opened.getexif().get(_ORIENTATION_TAG)
+        orientation = opened.getexif().get(ExifTags.Base.Orientation)
     except DECODER_ERRORS:
         return image
     if not isinstance(orientation, int) or not 2 <= orientation <= 8:
@@ -202,27 +215,7 @@ def upright(image: Image.Image, opened: Image.Image) -> Image.Image:
 def upright_size(encoded: bytes) -> tuple[int, int]:
     """Width and height, turned as the EXIF orientation says; nothing is decoded. Raises DECODER_ERRORS."""
     with Image.open(io.BytesIO(encoded)) as opened:
-        return upright(Image.new("1", opened.size), opened).size
-
-
-def opened_image(source: Source, file: str) -> Image.Image:
-    """A map or mask as it is stored, decoded; one that cannot be read is an error that names it."""
-    try:
-        opened = Image.open(io.BytesIO(source.read(file)))
-        opened.load()
-        return opened
-    except DECODER_ERRORS as problem:
-        raise ValueError(f"{file} in {source.path} cannot be read: {problem}") from problem
-
-
-def _as_rgb(image: Image.Image) -> Image.Image:
-    """Any of Pillow's modes as 8-bit RGB."""
-    if image.mode == "F" or image.mode.startswith("I"):
-        image = _from_high_depth(image)
-    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
-        layered = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", layered.size, (*_BACKGROUND, 255)), layered)
-    return image.convert("RGB")
+        return _upright(Image.new("1", opened.size), opened).size
 
 
 def _from_high_depth(image: Image.Image) -> Image.Image:
@@ -265,3 +258,106 @@ def fit_square(
         left, top = (width - side) // 2, (height - side) // 2
         image = image.crop((left, top, left + side, top + side))
     return image.resize(size, resample, reducing_gap=3.0)
+
+
+def as_batch(
+    images: GivenImages, size: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, "n 3 size size"]:
+    """Images for a model of side ``size``, in 0..1.
+
+    A tensor (N, 3, S, S) of numbers is returned as it is, on its own device. Files, Pillow images and arrays
+    are cropped to their centre square and resized (Lanczos) where they have another size.
+
+    Raises:
+        ValueError: values outside 0..1, or an array that is no image; the message says how to convert it.
+        FileNotFoundError: there is no such file.
+    """
+    if (
+        isinstance(images, Tensor)
+        and images.ndim == 4
+        and images.is_floating_point()
+        and images.shape[-1] != 3
+    ):
+        check_images(images, size)
+        refuse_values(images)
+        return images if images.dtype in (torch.float32, torch.bfloat16, torch.float16) else images.float()
+    squares = [fit_square(Image.fromarray(photo), size, "crop") for photo in as_photos(images)]
+    stacked = np.stack([np.asarray(square) for square in squares])
+    return torch.from_numpy(stacked).permute(0, 3, 1, 2).to(device).float() / 255
+
+
+def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Every image at its own size, as bytes; errors as `as_batch` raises them."""
+    if isinstance(images, (str, Path)):
+        return [read_photo(images)]
+    if isinstance(images, Image.Image):
+        return [np.array(upright_rgb(images))]
+    if isinstance(images, Tensor):
+        images = images.detach().cpu().numpy()
+    if not isinstance(images, np.ndarray):
+        if not isinstance(images, Sequence) or not images:
+            raise TypeError(
+                f"expected a path, a Pillow image, an array, a tensor or a list of them, got {images!r:.80}"
+            )
+        return [photo for image in images for photo in as_photos(image)]
+    shape = images.shape
+    batch = np.repeat(images[..., None], 3, axis=-1) if images.ndim == 2 else images
+    batch = batch[None] if batch.ndim == 3 else batch
+    if batch.ndim == 4 and batch.shape[-1] != 3:
+        batch = batch.transpose(0, 2, 3, 1)
+    if batch.ndim != 4 or batch.shape[-1] != 3:
+        raise ValueError(
+            f"an array of shape {shape} is no image: give (H, W, 3), (3, H, W), or a batch of either"
+        )
+    if batch.dtype != np.uint8:
+        if batch.dtype.kind != "f":
+            raise ValueError(
+                f"images must be bytes (uint8) or numbers in 0..1, got {images.dtype}: convert them"
+            )
+        refuse_values(batch)
+        batch = np.rint(np.clip(batch, 0, 1) * 255).astype(np.uint8)
+    return [np.ascontiguousarray(image) for image in batch]
+
+
+def read_photo(path: str | Path, pixel_limit: int = PIXEL_LIMIT) -> UInt8[np.ndarray, "h w 3"]:
+    """One image file at its own size, upright, as RGB; ``Unreadable`` says what is wrong with it."""
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist{nearest_sibling(path)}")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: name images, such as {path / '*.jpg'}")
+    try:
+        with quiet_pillow():
+            return decode_whole(read_bounded(path, FILE_LIMIT_BYTES), pixel_limit)
+    except ValueError as problem:
+        raise Unreadable(f"{path} cannot be used as an image: {problem}") from problem
+
+
+def refuse_values(images: Tensor | np.ndarray) -> None:
+    """Numbers that are not finite or not in 0..1 are an error; not looked for on devices that would wait."""
+    if isinstance(images, Tensor):
+        if images.device.type != "cpu" or torch.compiler.is_compiling():
+            return
+        images = images.detach().numpy()
+    if images.size == 0:
+        return
+    low, high = float(images.min()), float(images.max())
+    if not np.isfinite([low, high]).all():
+        first = int(np.isfinite(images.reshape(len(images), -1)).all(axis=1).argmin())
+        raise ValueError(
+            f"image {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
+        )
+    if low < -1e-3 or high > 1 + 1e-3:
+        fix = "divide by 255" if high > 2 else "add 1 and halve" if low >= -1.001 else "rescale them"
+        raise ValueError(f"images hold values from {low:.3g} to {high:.3g}, not in 0..1: {fix}")
+
+
+def check_images(images: Tensor, size: int) -> None:
+    """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
+    if images.ndim != 4 or images.shape[1:] != (3, size, size):
+        raise ValueError(
+            f"this model takes images of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
+            f"read them with derender.data.read_images(..., image_size={size}) or resize them"
+        )
+    if not images.is_floating_point():
+        raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")

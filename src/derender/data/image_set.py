@@ -12,7 +12,7 @@ version, and counts are exact. An image added later moves only those few that li
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -71,22 +71,15 @@ def split_indices(
     def digest(key: str) -> bytes:
         return hashlib.sha256(f"{seed}\0{key}".encode("utf-8", "surrogateescape")).digest()
 
+    exact = len(names) * np.array(fractions)
+    counts = (exact + 1e-9).astype(int)
+    largest_remainders = np.argsort(counts - exact, kind="stable")[: len(names) - counts.sum()]
+    counts[largest_remainders] += 1
     ordered = sorted(members, key=digest)
     ends = np.cumsum([0, *(len(members[key]) for key in ordered)])
-    targets = np.cumsum(_counts(len(names), fractions))
-    cuts = [int(np.abs(ends - end).argmin()) for end in targets[:2]]
+    cuts = [int(np.abs(ends - end).argmin()) for end in np.cumsum(counts)[:2]]
     parts = (ordered[: cuts[0]], ordered[cuts[0] : cuts[1]], ordered[cuts[1] :])
     return Split(*(np.array(sorted(row for key in part for row in members[key]), np.int64) for part in parts))
-
-
-def _counts(total: int, fractions: tuple[float, float, float]) -> list[int]:
-    """Whole numbers in these proportions that add up to the total (largest remainders round up)."""
-    exact = [total * fraction for fraction in fractions]
-    counts = [int(value + 1e-9) for value in exact]
-    by_remainder = sorted(range(3), key=lambda part: counts[part] - exact[part])
-    for part in by_remainder[: total - sum(counts)]:
-        counts[part] += 1
-    return counts
 
 
 MEMORY_LIMIT_BYTES = 2 << 30
@@ -223,42 +216,39 @@ def read_images(
     if limit is not None and limit < 1:
         raise ValueError(f"limit must be 1 or more, got {limit}")
     require_known("fit", fit, FITS)
-    with open_images(source, dataset=dataset, subset=subset, limit=limit) as stream:
+    with (
+        open_images(source, dataset=dataset, subset=subset, limit=limit) as stream,
+        closing(decoded(stream, image_size, fit=fit, workers=workers)) as chunks,
+        quiet_pillow(),
+    ):
+        found = _Found(keep_duplicates)
 
-        def fill(append: Callable[[np.ndarray], object]) -> dict[str, Any]:
-            """Decode everything and append the rows; what is known of them, as JSON has it."""
-            found = _Found(keep_duplicates)
-            with quiet_pillow(), closing(decoded(stream, image_size, fit=fit, workers=workers)) as chunks:
-                for chunk in chunks:
-                    append(chunk.images[found.add(chunk)])
-                    if progress is not None:
-                        done = chunk.start + len(chunk)
-                        progress(done, estimated_total(done, chunk.share, stream.limit))
+        def kept() -> Iterator[np.ndarray]:
+            """Decode everything, note it in ``found``, and yield the rows."""
+            for chunk in chunks:
+                yield chunk.images[found.add(chunk)]
+                if progress is not None:
+                    done = chunk.start + len(chunk)
+                    progress(done, estimated_total(done, chunk.share, stream.limit))
             if not found.files:
                 where, skipped = f"{stream.source} ({stream.layout})", found.skipped
                 first = f"the first is {skipped[0].file!r}: {skipped[0].reason}" if skipped else ""
                 none = f"none of the {len(skipped):,} images in {where} can be read; {first}"
                 raise ValueError(none if skipped else f"no image in {where}: it is empty")
-            return found.content()
 
         count = None if stream.table is None else len(stream.table.files)
         if cache is None and count is not None and count * 3 * image_size**2 <= memory_limit_bytes:
-            images, filled = np.empty((count, 3, image_size, image_size), np.uint8), 0
-
-            def append(rows: np.ndarray) -> None:
-                nonlocal filled
-                images[filled : filled + len(rows)] = rows
-                filled += len(rows)
-
-            content = fill(append)
-            return _joined(stream, images[:filled], content)
+            images = np.empty((count, 3, image_size, image_size), np.uint8)
+            for rows in kept():
+                images[len(found.files) - len(rows) : len(found.files)] = rows
+            return _joined(stream, images[: len(found.files)], found.content())
         settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
         made_of = repr((settings, PIL.__version__, stream.identity()))
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
         name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])
         file = cache_file(cache_folder() if cache is None else Path(cache), name, (stream.place, settings))
         if (cached := read_cache(file, fingerprint, image_size)) is None:
-            write_cache(file, fingerprint, image_size, fill)
+            write_cache(file, fingerprint, image_size, kept(), found.content)
             if (cached := read_cache(file, fingerprint, image_size)) is None:
                 raise OSError(f"decoded images could not be read back from {file}; check the disk")
         if progress is not None:
@@ -270,17 +260,6 @@ def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) 
     """Images of 0..255 as a float32 tensor of 0..1."""
     tensor = torch.from_numpy(np.array(images)) if isinstance(images, np.ndarray) else images
     return tensor.to(torch.float32) / 255
-
-
-def check_images(images: Tensor, size: int) -> None:
-    """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
-    if images.ndim != 4 or images.shape[1:] != (3, size, size):
-        raise ValueError(
-            f"this model takes images of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
-            f"read them with derender.data.read_images(..., image_size={size}) or resize them"
-        )
-    if not images.is_floating_point():
-        raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")
 
 
 @dataclass

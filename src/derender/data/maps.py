@@ -11,20 +11,23 @@ The set does not state this, and it is untested on the archive. Look at the aver
 unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
 """
 
+import io
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
-from derender.data.image import fit_square, opened_image, quiet_pillow, upright_size
+from derender.data.image import DECODER_ERRORS, fit_square, quiet_pillow, upright_size
 from derender.data.image_set import ImageSet, read_images
+from derender.data.layouts import layout_named
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
-from derender.data.layouts.rendered import CAMERA, DEPTH_PAIRS, LIGHT, SYNFACE, pairs_of, rendered_folders
+from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
 from derender.data.opening import list_images, open_source, parse_source
 from derender.data.source import Source
 from derender.data.stream import Progress, usable_cores
@@ -106,10 +109,16 @@ def read_masks(
     limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
     with files:
         if listed is not None:
-            _require_all(files, listed.layout, listed.table)
+            if "mask" not in listed.table.labels:
+                raise ValueError(
+                    f"{files.path} holds no masks (it was read as {listed.layout}): expected images/NAME.jpg "
+                    "with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
+                )
+            _require_masks(files, listed.table.files, listed.table.labels["mask"].tolist())
         how = {"dataset": dataset, "subset": subset, "fit": fit, "workers": workers, "progress": progress}
         images = read_images(source, image_size, **how, **reading)
         names = images.label("mask").tolist() if own else _named_alike(files, images.files)
+        _require_masks(files, images.files, names)
         parts = parts_of(files) if own else {}
         found = np.empty((len(images), image_size, image_size), np.uint8)
 
@@ -154,7 +163,7 @@ def read_ground_truth(
     place, named, options = parse_source(source)
     with open_source(Path(place).expanduser()) as opened:
         pairs = {} if rendered_folders(opened) else pairs_of(opened)
-        layout = DEPTH_PAIRS if pairs else SYNFACE
+        layout = layout_named("depth_pairs" if pairs else "synface")
         table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
         table = half_of(table, options.get("half", "all"))
         if pairs:
@@ -162,24 +171,18 @@ def read_ground_truth(
         return _read_maps(opened, table, limit)
 
 
-def _require_all(files: Source, layout: str, table: Table) -> None:
-    """Every image has a mask, or an error says how many have none."""
-    if "mask" not in table.labels:
+def _require_masks(source: Source, images: Sequence[str], masks: Sequence[str]) -> None:
+    """Every image has a mask in the source, or an error says how many have none."""
+    if bare := [image for image, mask in zip(images, masks, strict=True) if not mask]:
         raise ValueError(
-            f"{files.path} holds no masks (it was read as {layout}): expected images/NAME.jpg with "
-            f"masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
-        )
-    bare = [file for file, mask in zip(table.files, table.labels["mask"], strict=True) if not mask]
-    if bare:
-        raise ValueError(
-            f"{len(bare):,} of {len(table.files):,} images in {files.path} have no mask, the first is "
-            f"{bare[0]!r}; add the masks or take these images out"
+            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
+            f"{bare[0]!r}; add the masks (NAME.png for NAME.jpg), or take these images out"
         )
 
 
 def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
     """A mask that holds class numbers; a palette's colours do not matter."""
-    values = np.asarray(opened_image(source, file))
+    values = np.asarray(_opened(source, file))
     if values.ndim > 2:
         raise ValueError(
             f"{file} in {source.path} has {values.shape[2]} channels; a mask has one, of class numbers"
@@ -192,7 +195,7 @@ def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.n
 
 def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
     """The parts of one face, at least one, over one another, in the order of their class numbers."""
-    parts = {number: np.asarray(opened_image(source, files[number]).convert("L")) for number in sorted(files)}
+    parts = {number: np.asarray(_opened(source, files[number]).convert("L")) for number in sorted(files)}
     merged = np.zeros(next(iter(parts.values())).shape, np.uint8)
     for number, part in parts.items():
         if part.shape != merged.shape:
@@ -212,11 +215,6 @@ def _named_alike(source: Source, images: tuple[str, ...]) -> list[str]:
     for image in images:
         alike = by_stem.get(stem_of(image), [])
         names.append(by_path.get(image.rpartition(".")[0]) or (alike[0] if len(alike) == 1 else ""))
-    if bare := [image for image, name in zip(images, names, strict=True) if not name]:
-        raise ValueError(
-            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
-            f"{bare[0]!r}: expected {PurePosixPath(bare[0]).with_suffix('.png')} there"
-        )
     return names
 
 
@@ -264,7 +262,7 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
         for name in names:
             if name not in known:
                 raise ValueError(f"{source.path} has no {name}, which other images have")
-            opened = opened_image(source, name)
+            opened = _opened(source, name)
             array = np.asarray(opened)
             if opened.mode not in modes or (arrays and array.shape != arrays[0].shape):
                 raise ValueError(
@@ -301,10 +299,10 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
 
 def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -> GroundTruth:
     """Images beside depth maps: neither normals nor albedo, light and camera are known."""
-    images, depths, masks = [], [], []
+    images, depths = [], []
     for file, map_file in pairs.items():
-        depth, mask = _read_depth(source, map_file, image_size)
-        image = opened_image(source, file).convert("RGB")
+        depth = _read_depth(source, map_file, image_size)
+        image = _opened(source, file).convert("RGB")
         if image.width != image.height:
             raise ValueError(f"{file} in {source.path} is {image.size}: images with depth must be square")
         if image_size is not None:
@@ -316,21 +314,19 @@ def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -
             )
         images.append(np.asarray(image))
         depths.append(depth)
-        masks.append(mask)
+    depth = np.stack(depths)
     nothing = dict.fromkeys(("normal", "albedo", "light", "camera"))
-    exact = {"depth": np.stack(depths), "mask": np.stack(masks)}
-    return GroundTruth(_channels_first(np.stack(images)), **exact, **nothing, files=tuple(pairs), labels={})
+    exact = {"images": _channels_first(np.stack(images)), "depth": depth, "mask": depth > 0}
+    return GroundTruth(**exact, **nothing, files=tuple(pairs), labels={})
 
 
-def _read_depth(
-    source: Source, file: str, size: int | None
-) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """One depth map, z with 0 for background, and where the object is; at ``size`` if given.
+def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarray, "h w"]:
+    """One depth map, z with 0 for background; at ``size`` if given.
 
     Maps are shrunk by area, over the object's pixels alone; a pixel is on the object where more than half of
     it is.
     """
-    opened = opened_image(source, file)
+    opened = _opened(source, file)
     mode, code = opened.mode, np.asarray(opened)
     if mode == "RGB" and (code == code[..., :1]).all():
         code = code[..., 0]
@@ -342,13 +338,23 @@ def _read_depth(
     nearness = code / (255 if code.dtype == np.uint8 else 65_535)
     depth = np.where(mask, far - (far - near) * nearness, 0).astype(np.float32)
     if size is None or depth.shape == (size, size):
-        return depth, mask
+        return depth
     by_area, share = (
         np.asarray(Image.fromarray(one.astype(np.float32)).resize((size, size), Image.Resampling.BOX))
         for one in (depth, mask)
     )
     small = share > 0.5
-    return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32), small
+    return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32)
+
+
+def _opened(source: Source, file: str) -> Image.Image:
+    """A map or mask as it is stored, decoded; one that cannot be read is an error that names it."""
+    try:
+        opened = Image.open(io.BytesIO(source.read(file)))
+        opened.load()
+        return opened
+    except DECODER_ERRORS as problem:
+        raise ValueError(f"{file} in {source.path} cannot be read: {problem}") from problem
 
 
 def _channels_first(code: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from urllib.parse import parse_qsl
 
@@ -317,19 +317,14 @@ def _kind_of(path: Path, written: str) -> str | None:
 
 def _kind_of_folder(folder: Path) -> str | None:
     """Shards or a library's files, if no image lies among the first files in it."""
-    kind = None
-    for name in islice(_names(folder), _ENTRIES_LOOKED_AT):
-        if is_image(name):
-            return None
-        if name.lower().endswith(SHARD_SUFFIXES):
-            kind = kind or "webdataset"
-        elif name.lower().endswith(".parquet"):
-            kind = kind or "huggingface"
-    return kind
-
-
-def _names(folder: Path) -> Iterator[str]:
-    """Names of the files below a folder, its own first."""
+    kind, looked_at = None, 0
     for _, folders, names in os.walk(folder):
+        if any(map(is_image, names)):
+            return None
+        for name in map(str.lower, names):
+            streamed = "webdataset" if name.endswith(SHARD_SUFFIXES) else None
+            kind = kind or streamed or ("huggingface" if name.endswith(".parquet") else None)
         folders[:] = [name for name in folders if not is_hidden(name)]
-        yield from names
+        if (looked_at := looked_at + len(names)) >= _ENTRIES_LOOKED_AT:
+            break
+    return kind

@@ -13,7 +13,7 @@ import lzma
 import re
 import tarfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import accumulate, islice, product
@@ -163,22 +163,24 @@ def find_shards(path: Path, source: str, part: str | None = None) -> list[Path]:
 
 def expand_braces(pattern: str) -> Iterator[str]:
     """``a-{00..02}.tar`` to its three names, ``{x,y}`` to two; numbers keep the width they are written in."""
-    pieces = re.split(r"\{([^{}]*)\}", pattern)
-    choices = [[piece] if place % 2 == 0 else _choices(piece, pattern) for place, piece in enumerate(pieces)]
+    choices: list[Iterable[str]] = []
+    for place, piece in enumerate(re.split(r"\{([^{}]*)\}", pattern)):
+        numbers = re.fullmatch(r"(\d+)\.\.(\d+)", piece)
+        if place % 2 == 0:
+            choices.append([piece])
+        elif numbers is not None:
+            first, last = int(numbers[1]), int(numbers[2])
+            if last < first or last - first >= _MOST_SHARDS:
+                raise ValueError(
+                    f"{{{piece}}} in {pattern} should count up, to at most {_MOST_SHARDS:,} names"
+                )
+            width = len(numbers[1]) if numbers[1].startswith("0") else 0
+            choices.append([f"{number:0{width}d}" for number in range(first, last + 1)])
+        elif "," in piece:
+            choices.append(piece.split(","))
+        else:
+            raise ValueError(f"{{{piece}}} in {pattern} should read {{000..009}} or {{a,b}}")
     return map("".join, product(*choices))
-
-
-def _choices(inner: str, pattern: str) -> list[str]:
-    numbers = re.fullmatch(r"(\d+)\.\.(\d+)", inner)
-    if numbers is None:
-        if "," in inner:
-            return inner.split(",")
-        raise ValueError(f"{{{inner}}} in {pattern} should read {{000..009}} or {{a,b}}")
-    first, last = int(numbers[1]), int(numbers[2])
-    if last < first or last - first >= _MOST_SHARDS:
-        raise ValueError(f"{{{inner}}} in {pattern} should count up, to at most {_MOST_SHARDS:,} names")
-    width = len(numbers[1]) if numbers[1].startswith("0") else 0
-    return [f"{number:0{width}d}" for number in range(first, last + 1)]
 
 
 def _series(shard: Path) -> tuple[str, str]:

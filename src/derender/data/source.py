@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -38,7 +38,23 @@ class Skipped:
     reason: str
 
 
-class Source(ABC):
+C = TypeVar("C", bound="Closing")
+
+
+class Closing:
+    """What may hold files open until it is closed, or left as a context."""
+
+    def close(self) -> None:
+        """Release what is held open."""
+
+    def __enter__(self: C) -> C:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class Source(Closing, ABC):
     """Named files, read by name."""
 
     path: Path  # the folder or file that the user named
@@ -56,15 +72,6 @@ class Source(ABC):
     def size(self, file: str) -> int:
         """The bytes of one file, unpacked."""
         return int(self.stamps((file,))[0, 0])
-
-    def close(self) -> None:  # noqa: B027  (folders hold nothing open)
-        """Release what the source holds open."""
-
-    def __enter__(self) -> "Source":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     @cached_property
     def images(self) -> tuple[str, ...]:
@@ -114,50 +121,41 @@ class FolderSource(FileSource):
 
     def __init__(self, path: Path):
         self.path = path
-        self._found, faults = _walk(str(path))
+        self._found: dict[str, str] = {}  # each file's path by its printable path
+        faults: dict[str, str] = {}  # what is no file, and why
+        seen: set[tuple[int, int]] = set()
+        waiting = [""]
+        while waiting:
+            here, below = waiting.pop(), []
+            try:
+                status = os.stat(f"{path}/{here}")  # noqa: PTH116  (a million times)
+                if (status.st_dev, status.st_ino) in seen:
+                    continue
+                seen.add((status.st_dev, status.st_ino))
+                with os.scandir(f"{path}/{here}") as listed:
+                    entries = [entry for entry in listed if not is_hidden(entry.name)]
+            except OSError as problem:
+                faults[here.rstrip("/") or "."] = f"folder cannot be listed: {problem.strerror}"
+                continue
+            for entry in entries:
+                name = f"{here}{entry.name}"
+                try:
+                    mode = entry.stat().st_mode
+                except OSError as problem:
+                    faults[name] = f"broken link or unreachable file: {problem.strerror}"
+                    continue
+                if stat.S_ISREG(mode):
+                    self._found[printable(name)] = name
+                elif stat.S_ISDIR(mode):
+                    below.append(f"{name}/")
+                else:
+                    faults[name] = "not a regular file"
+            waiting += sorted(below, reverse=True)
         self.files = tuple(sorted(self._found))
-        self.skipped = tuple(sorted(faults, key=lambda row: row.file))
+        self.skipped = tuple(Skipped(printable(name), faults[name]) for name in sorted(faults))
 
     def on_disk(self, file: str) -> Path:
         return self.path / self._found[file]
-
-
-def _walk(root: str) -> tuple[dict[str, str], list[Skipped]]:
-    """Each file's path by its printable path; and what is no file."""
-    found: dict[str, str] = {}
-    faults: list[Skipped] = []
-    seen: set[tuple[int, int]] = set()
-    waiting = [""]
-    while waiting:
-        here = waiting.pop()
-        try:
-            status = os.stat(f"{root}/{here}")  # noqa: PTH116  (a million times)
-            if (status.st_dev, status.st_ino) in seen:
-                continue
-            seen.add((status.st_dev, status.st_ino))
-            with os.scandir(f"{root}/{here}") as listed:
-                entries = [entry for entry in listed if not is_hidden(entry.name)]
-        except OSError as problem:
-            name = printable(here.rstrip("/") or ".")
-            faults.append(Skipped(name, f"folder cannot be listed: {problem.strerror}"))
-            continue
-        below: list[str] = []
-        for entry in entries:
-            path = f"{here}{entry.name}"
-            try:
-                status = entry.stat()
-            except OSError as problem:
-                reason = f"broken link or unreachable file: {problem.strerror}"
-                faults.append(Skipped(printable(path), reason))
-                continue
-            if stat.S_ISREG(status.st_mode):
-                found[printable(path)] = path
-            elif stat.S_ISDIR(status.st_mode):
-                below.append(f"{path}/")
-            else:
-                faults.append(Skipped(printable(path), "not a regular file"))
-        waiting += sorted(below, reverse=True)
-    return found, faults
 
 
 def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:

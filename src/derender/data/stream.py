@@ -14,16 +14,14 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
 from derender.data.image import LARGE_BYTES, Unreadable, decode, one_large_image_at_a_time
 from derender.data.layouts.layout import Table, number_column, text_column
-from derender.data.source import Skipped
+from derender.data.source import Closing, Skipped
 
-S = TypeVar("S", bound="Stream")
 Value = str | int | float | bool | None  # one label of one image; None is unknown
 _EXACT_IN_FLOAT32 = 1 << 24
 
@@ -44,7 +42,7 @@ class Sample:
     size: Callable[[], int] = int  # gives the number of these bytes, 0 where they are in memory already
 
 
-class Stream(ABC):
+class Stream(Closing, ABC):
     """Samples in a fixed order."""
 
     source: str  # what the user named
@@ -70,15 +68,6 @@ class Stream(ABC):
     def place(self) -> str:
         """Where it is, the same from every folder one may work in."""
         return str(Path(self.source).absolute())
-
-    def close(self) -> None:  # noqa: B027  (most hold nothing open)
-        """Release what the stream holds open."""
-
-    def __enter__(self: S) -> S:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def unreadable(reason: str) -> Callable[[], bytes]:

@@ -24,7 +24,7 @@ from derender.evaluation.memory import Memory
 from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, mean_image
 from derender.evaluation.score_table import Scores
 from derender.features import Progress, embed_images, model_fingerprint
-from derender.inputs import as_images, as_model, require_fitting
+from derender.inputs import as_images, as_model
 from derender.model import Derenderer
 
 COMPONENT_IMAGES = 2_000
@@ -140,7 +140,7 @@ def optimised(model: Derenderer, steps: int | None) -> Derenderer:
     """The model, or with steps one whose scenes are optimised per image."""
     if not steps:
         return model
-    require_fitting(model)
+    model.features.required_fitting("this model")
     fitted = copy.copy(model)
     fitted.decompose = lambda images: model.fit_scenes(images, steps).scene
     return fitted

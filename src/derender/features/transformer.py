@@ -11,7 +11,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 
 import derender
 from derender.data import read_image
-from derender.data.given import refuse_values
+from derender.data.image import refuse_values
 from derender.features.extract import embed_images
 from derender.features.table import named
 

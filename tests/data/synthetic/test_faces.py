@@ -84,7 +84,7 @@ def test_a_track_keeps_light_and_person_while_the_head_moves_smoothly():
     whole = np.abs(camera[:, -1] - camera[:, 0])
     assert whole[:, :3].max(axis=1).min() > 0.02 and np.rad2deg(whole[:, 1]).max() <= 18.01
     assert (step.sum(axis=1) <= whole + 1e-6).all()  # no way back
-    assert (made.strength.reshape(6, 5).std(axis=1) > 1e-4).all()
+    assert (made.labels["strength"].reshape(6, 5).std(axis=1) > 1e-4).all()
     again = faces.generate(4, image_size=32, seed=2, settings=settings, first=17)
     assert (again.images == made.images[17:21]).all()
 

@@ -16,13 +16,7 @@ import yaml
 from jaxtyping import Float, Int64
 
 from derender.data.doctor import measures
-from derender.data.doctor.measures import (
-    JackknifeEstimate,
-    SymmetryAxis,
-    evenly,
-    jackknife,
-    measure_originals,
-)
+from derender.data.doctor.measures import JackknifeEstimate, evenly
 from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
 from derender.data.source import is_image
@@ -83,8 +77,8 @@ class Check:
     noted: float | None = None
 
 
-_TABLE = yaml.safe_load(Path(__file__).with_name("checks.yaml").read_text(encoding="utf-8"))
-CHECKS = {name: Check(**row) for name, row in _TABLE.items()}  # by the names of the measures
+_TABLE = Path(__file__).with_name("checks.yaml").read_text(encoding="utf-8")
+CHECKS = {name: Check(**row) for name, row in yaml.safe_load(_TABLE).items()}  # by the names of the measures
 
 
 def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:
@@ -110,11 +104,10 @@ def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFi
     check = CHECKS[name]
     level, certain = judged(value, check)
     is_share = check.noted is not None
-    number = (
-        percent(value.value) if is_share else format(value.value, ",.0f" if value.value >= 1000 else ",.3g")
-    )
-    clause = check.good if (value.value == 0 if is_share else level == "good") else check.bad
-    clause = clause.format(number=number)
+    number = format(value.value, ",.0f" if value.value >= 1000 else ",.3g")
+    number = percent(value.value) if is_share else number
+    in_order = value.value == 0 if is_share else level == "good"
+    clause = (check.good if in_order else check.bad).format(number=number)
     measured = [] if "{number}" in check.bad else [f"{check.label} {number}"]
     if value.error:
         measured.append(f"± {percent(2 * value.error) if is_share else format(2 * value.error, '.2g')}")
@@ -127,7 +120,7 @@ def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFi
 
 
 def findings_of(
-    values: Mapping[str, JackknifeEstimate], details: Mapping[str, str], axis: SymmetryAxis | None
+    values: Mapping[str, JackknifeEstimate], details: Mapping[str, str], axis: measures.SymmetryAxis | None
 ) -> tuple[CheckFinding, ...]:
     """A finding for every value; without an axis nothing was compared, and the rest stays open."""
     found = {name: finding_of(name, values[name], details.get(name, "")) for name in CHECKS if name in values}
@@ -167,10 +160,6 @@ def percent(share: float) -> str:
     return "over 99 %" if 0.99 < share < 1 else f"{100 * share:.0f} %"
 
 
-__all__ = [
-    "CHECKS", "CheckFinding", "Examination", "Verdict", "doctor", "measure_originals", "percent",
-]  # fmt: skip
-
 EXAMINED_PX = 64  # side at which images are read for an examination
 COMPARED = 4_000  # most distinct images that are compared with one another, evenly spaced
 FEWEST_COMPARED = 2 * measures.GROUPS  # with fewer distinct images nothing can be said about what they share
@@ -180,14 +169,12 @@ SHOWN = 8  # images in each row of examples, at most
 
 @dataclass(frozen=True)
 class Shared:
-    """What distinct images share. Rows that were compared; measures by their names in ``CHECKS``; the axis of
-    symmetry; orders of these images by the names of their two ends.
-    """
+    """What distinct images share."""
 
-    rows: Int64[np.ndarray, " k"]
-    values: Mapping[str, JackknifeEstimate]
+    rows: Int64[np.ndarray, " k"]  # that were compared
+    values: Mapping[str, JackknifeEstimate]  # measures by their names in ``CHECKS``
     axis: measures.SymmetryAxis
-    orders: Mapping[tuple[str, str], Float[np.ndarray, " k"]]
+    orders: Mapping[tuple[str, str], Float[np.ndarray, " k"]]  # of the rows, by the names of their two ends
 
 
 @dataclass(frozen=True)
@@ -266,9 +253,8 @@ def doctor(
         images = read_images(source, EXAMINED_PX, **how)
         with open_images(source, dataset=dataset) as stream:
             if isinstance(stream, ListedStream):
-                originals = measure_originals(stream.files, images.files, EXAMINED_PX)
-    count, unreadable = len(images), len(images.skipped)
-    if count == 0:
+                originals = measures.measure_originals(stream.files, images.files, EXAMINED_PX)
+    if (count := len(images)) == 0:
         raise ValueError(f"there is no image to examine in {images.source}")
     pixels = measures.measure_pixels(images.images, progress)
     group = measures.near_copy_groups(pixels.tiny)
@@ -279,7 +265,7 @@ def doctor(
     shares = {
         "distinct": len(distinct),
         "copies": 1 - len(distinct) / count,
-        "unreadable": unreadable / (unreadable + count),
+        "unreadable": len(images.skipped) / (len(images.skipped) + count),
         "clipped": pixels.clipped.mean(),
         "blank": pixels.blank.mean(),
         "grey": pixels.colourless.mean(),
@@ -294,9 +280,8 @@ def doctor(
     values = {name: JackknifeEstimate(float(value)) for name, value in shares.items()}
     values |= {} if shared is None else shared.values
     findings = findings_of(values, details, None if shared is None else shared.axis)
-    examples = _examples(pixels, group, shared)
-    verdict = verdict_of(findings)
-    return Examination(images, verdict, findings, values, group, identical, originals, shared, examples)
+    found = verdict_of(findings), findings, values, group, identical, originals, shared
+    return Examination(images, *found, _examples(pixels, group, shared))
 
 
 def quick_verdict(images: ImageSet) -> str:
@@ -310,9 +295,7 @@ def quick_verdict(images: ImageSet) -> str:
     return "" if verdict.word == "suits" else verdict.text
 
 
-def _compare(
-    images: ImageSet, rows: Int64[np.ndarray, " n"], generator: np.random.Generator
-) -> Shared | None:
+def _compare(images: ImageSet, rows: np.ndarray, generator: np.random.Generator) -> Shared | None:
     """Compare distinct images; None of too few."""
     if len(rows) < FEWEST_COMPARED:
         return None
@@ -324,8 +307,9 @@ def _compare(
     odd = float((alike < ODD_LIKENESS).mean())
     of_edges = {"agreement": measures.agreement, "symmetry": measures.symmetry}
     of_edges |= {"fill": measures.frame_filled, "view": measures.view_variety}
-    values = {name: jackknife(lambda kept, of=of: of(edges[kept]), count) for name, of in of_edges.items()}
-    values["light"] = jackknife(lambda kept: measures.light_variety(sides[kept]), count)
+    error_of = measures.jackknife
+    values = {name: error_of(lambda kept, of=of: of(edges[kept]), count) for name, of in of_edges.items()}
+    values["light"] = error_of(lambda kept: measures.light_variety(sides[kept]), count)
     values["odd"] = JackknifeEstimate(odd, float(np.sqrt(odd * (1 - odd) / count)))
     orders = {
         ("least typical", "most typical"): alike,
@@ -348,18 +332,14 @@ def _examples(
     if len(copies):
         some = copies[evenly(len(copies), SHOWN // 2)]
         examples["copies, in pairs"] = np.stack([group[some], some], axis=1).ravel()
-
-    def spread(title: str, rows: np.ndarray) -> None:
-        examples[title] = rows[evenly(len(rows), SHOWN)]
-
     if pixels.blank.any():
-        spread("empty", np.flatnonzero(pixels.blank))
+        examples["empty"] = np.flatnonzero(pixels.blank)
     if shared is None:
-        spread("all distinct", np.unique(group))
+        examples["all distinct"] = np.unique(group)
     elif shared.values["agreement"].value < (CHECKS["agreement"].objects or 0):
-        spread("evenly through the set", shared.rows)
+        examples["evenly through the set"] = shared.rows
     else:
         for (low, high), values in shared.orders.items():
             order = shared.rows[np.argsort(values)]
             examples |= {low: order[:SHOWN], high: order[::-1][:SHOWN]}
-    return {name: tuple(map(int, rows)) for name, rows in examples.items()}
+    return {name: tuple(rows[evenly(len(rows), SHOWN)].tolist()) for name, rows in examples.items()}

@@ -36,13 +36,11 @@ _MIRRORED = [0, *range(ORIENTATIONS - 1, 0, -1)]
 _MARGIN, _REACH = 0.02, 14  # of the axis of symmetry
 _SPLITS, _SPLIT_COMPONENTS, _STARTS, _SMALLEST = 8, 16, 3, 5
 _MIDDLE = slice(10, 16), slice(16, 22)  # of 32 pixels, on either side of the middle
-_CLIP = 0.01  # share at each end that is drawn in before standard deviations are taken
 _CHUNK = 256
 _COLOURLESS = 4.0  # mean distance of the channels, in values of 255: below it no colour is seen
 _BLANK = 2.0  # standard deviation of grey, in values of 255: below it there is nothing to see
 _WEIGHTS = np.array([0.299, 0.587, 0.114], np.float32)
 _COMPONENTS, _NEIGHBOURS, _SAMPLE = 12, 6, 4_000
-_HEADERS = 1_000
 _PAIRS_AT_ONCE = 65_536
 
 Grey = Float32[np.ndarray, "n 32 32"]
@@ -61,18 +59,14 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Originals:
-    """Sizes of a sample of files, in pixels, upright.
-
-    ``smaller`` is the share, 0..1, of files with a short side below ``image_size``. ``oblong`` is that of
-    files whose sides differ by more than a quarter.
-    """
+    """Sizes of a sample of files, in pixels, upright."""
 
     sampled: int
     median_short: int
     smallest_short: int
     largest_long: int
-    smaller: float
-    oblong: float
+    smaller: float  # share, 0..1, of files with a short side below ``image_size``
+    oblong: float  # share of those whose sides differ by more than a quarter
     image_size: int
 
 
@@ -86,12 +80,10 @@ class JackknifeEstimate:
 
 @dataclass(frozen=True)
 class SymmetryAxis:
-    """The axis about which the mean image of edges is most symmetric. Its distance from the middle as a share
-    of the width (right is positive), and the correlation of the two sides, -1..1, best 1.
-    """
+    """The axis about which the mean image of edges is most symmetric."""
 
-    offset: float
-    correlation: float
+    offset: float  # from the middle, as a share of the width; right is positive
+    correlation: float  # of the two sides, -1..1, best 1
 
 
 def evenly(count: int, most: int) -> Int64[np.ndarray, " k"]:
@@ -150,10 +142,9 @@ def near_copy_groups(tiny: Float32[np.ndarray, "n d"]) -> Int64[np.ndarray, " n"
         merged = standing[_merged(tiny[standing], places[standing])]
         if (merged == standing).all():
             break
-        new_first = np.arange(len(tiny))
-        new_first[standing] = merged
-        group = new_first[group]
-        standing = np.unique(merged)
+        first = np.arange(len(tiny))
+        first[standing] = merged
+        group, standing = first[group], np.unique(merged)
     return group
 
 
@@ -178,7 +169,7 @@ def measure_originals(source: Source, files: tuple[str, ...], image_size: int) -
     """Read the headers of at most 1,000 files, evenly spaced; None if none is readable."""
     sizes = []
     with quiet_pillow():
-        for row in evenly(len(files), min(_HEADERS, len(files))):
+        for row in evenly(len(files), min(1_000, len(files))):
             try:
                 sizes.append(sorted(upright_size(source.read(files[row]))))
             except DECODER_ERRORS:
@@ -288,7 +279,7 @@ def side_light(grey: Grey) -> Float[np.ndarray, "n 2"]:
 
 def light_variety(sides: Float[np.ndarray, "n 2"]) -> float:
     """Standard deviation of side light that both halves share; 0 (or less, by chance): all lit alike."""
-    upper, lower = (np.clip(half, *np.quantile(half, (_CLIP, 1 - _CLIP))) for half in sides.T)
+    upper, lower = (np.clip(half, *np.quantile(half, (0.01, 0.99))) for half in sides.T)
     shared = float(np.cov(upper, lower)[0, 1])
     return float(np.sign(shared) * np.sqrt(abs(shared)))
 

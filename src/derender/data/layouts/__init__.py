@@ -8,19 +8,19 @@ of its images, of which there may be millions.
 from collections.abc import Callable
 from functools import cache
 
-from derender.data.layouts.celeba import CELEBA, CELEBAMASK
-from derender.data.layouts.faces import FACE_TRACKS, LFW, RAFDB, UTKFACE, YALE
+from derender.data.layouts import celeba, faces, rendered, tables
 from derender.data.layouts.layout import (
     PARTITION_NAMES,
+    TOLD,
     Layout,
     Table,
+    base_name,
+    mostly,
     parent_name,
     partition_by_folder,
     partition_column,
     text_column,
 )
-from derender.data.layouts.rendered import DEPTH_PAIRS, SHAPENET_CARS, SYNCAR, SYNFACE, SYNFACE_TRACKS
-from derender.data.layouts.tables import TABLE
 from derender.data.source import Source
 from derender.storage.places import require_known
 
@@ -53,13 +53,24 @@ def _load_classes(source: Source) -> Table:
     return Table(source.images, labels, _load_folder(source).partition)
 
 
-CLASSES = Layout("classes", "one folder per class", _is_classes, _load_classes)
-FOLDER = Layout("folder", "images in any arrangement", lambda source: True, _load_folder)
-
-LAYOUTS = (
-    *(TABLE, SYNCAR, SYNFACE, SYNFACE_TRACKS, DEPTH_PAIRS, RAFDB, CELEBAMASK, CELEBA, UTKFACE, YALE, LFW),
-    *(SHAPENET_CARS, FACE_TRACKS, CLASSES, FOLDER),
-)
+_READERS = {  # by name: whether a source looks like the layout, and the table of its images
+    "table": (tables.is_listed, tables.load_listed),
+    "syncar": (lambda source: "class" in rendered.columns(source), rendered.load_rendered),
+    "synface": (rendered.is_synface, rendered.load_rendered),
+    "synface_tracks": (rendered.is_tracks, rendered.load_tracks),
+    "depth_pairs": (rendered.is_paired, rendered.load_pairs),
+    "rafdb": (lambda source: faces.raf_list(source) is not None, faces.load_rafdb),
+    "celebamask": (celeba.is_celebamask, celeba.load_celebamask),
+    "celeba": (celeba.is_celeba, celeba.load_celeba),
+    "utkface": (lambda source: mostly(faces.UTK_NAME, map(base_name, source.images)), faces.load_utkface),
+    "yaleb": (lambda source: mostly(faces.YALE_NAME, map(base_name, source.images)), faces.load_yale),
+    "lfw": (lambda source: mostly(faces.LFW_NAME, source.images), faces.load_lfw),
+    "shapenet_cars": (rendered.is_cars, rendered.load_cars),
+    "face_tracks": (faces.is_tracks, faces.load_tracks),
+    "classes": (_is_classes, _load_classes),
+    "folder": (lambda source: True, _load_folder),
+}
+LAYOUTS = tuple(Layout(name, *readers, **TOLD[name]) for name, readers in _READERS.items())
 
 
 def layout_named(name: str) -> Layout:

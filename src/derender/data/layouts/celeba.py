@@ -23,8 +23,8 @@ from jaxtyping import Float32
 
 from derender.data.layouts.layout import (
     MOSTLY,
+    TOLD,
     Labels,
-    Layout,
     Table,
     base_name,
     header_of,
@@ -36,9 +36,6 @@ from derender.data.layouts.layout import (
 )
 from derender.data.source import Source
 
-CELEBA_HOME = "https://mmlab.ie.cuhk.edu.hk/projects/CelebA.html"
-MASK_HOME = "https://github.com/switchablenorms/CelebAMask-HQ"
-
 MASK_CLASSES = (
     *("background", "skin", "nose", "eye_g", "l_eye", "r_eye", "l_brow", "r_brow", "l_ear", "r_ear"),
     *("mouth", "u_lip", "l_lip", "hair", "hat", "ear_r", "neck_l", "neck", "cloth"),
@@ -49,7 +46,8 @@ necklace."""
 BOX_LIST = "boxes.csv"
 
 _PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
-_FIRST_NUMBERS = {"test": 182_638, "validation": 162_771, "train": 1}  # the parts are runs of image numbers
+_IN_ORDER = np.array(["", *_PARTITIONS.values()])  # the parts are runs of image numbers, from these on
+_FIRST_NUMBERS = (1, 162_771, 182_638)
 _EYES_AND_MOUTH = (
     *("lefteye_x", "lefteye_y", "righteye_x", "righteye_y"),
     *("leftmouth_x", "leftmouth_y", "rightmouth_x", "rightmouth_y"),
@@ -117,33 +115,24 @@ def _owners_list(
     return _OwnersList(where, columns, rows)
 
 
-def _attributes(source: Source, stem: str, names: Sequence[str]) -> Labels | None:
-    """Every attribute as 1 yes, 0 no, -1 unknown (no row) for these images; None without the list."""
+def _attributes(source: Source, stem: str, names: Sequence[str]) -> Labels:
+    """Every attribute as 1 yes, 0 no, -1 unknown (no row) for these images; none without the list."""
     listed = _owners_list(source, stem, ("-1", "0", "1"), " of -1 or 1")
     if listed is None:
-        return None
+        return {}
     rows = {name: np.array([value == "1" for value in row], np.int8) for name, row in listed.rows.items()}
     unknown = np.full(len(listed.columns), -1, np.int8)
     values = np.array([rows.get(name, unknown) for name in names], np.int8).reshape(len(names), -1)
     return {column: values[:, place].copy() for place, column in enumerate(listed.columns)}
 
 
-def _partition(source: Source, names: Sequence[str]) -> np.ndarray | None:
-    """The official part of each image of CelebA, "" where it has no row; None without the list."""
-    meaning = " of 0 (train), 1 (validation) or 2 (test)"
-    listed = _owners_list(source, "list_eval_partition", tuple(_PARTITIONS), meaning)
-    if listed is None:
-        return None
-    return text_column(_PARTITIONS[listed.rows[name][0]] if name in listed.rows else "" for name in names)
-
-
-def _is_celeba(source: Source) -> bool:
+def is_celeba(source: Source) -> bool:
     return source.named("list_attr_celeba.txt", "list_attr_celeba.csv") is not None
 
 
-def _load_celeba(source: Source) -> Table | None:
+def load_celeba(source: Source) -> Table | None:
     """Attributes, and identity and the official partition where their lists are there; boxes in the wild."""
-    if not _is_celeba(source) or not source.images:
+    if not is_celeba(source) or not source.images:
         return None
     aligned, wild = (
         tuple(file for file in source.images if folder in file.split("/")[:-1])
@@ -151,12 +140,14 @@ def _load_celeba(source: Source) -> Table | None:
     )
     files = aligned or wild or source.images
     names = [base_name(file) for file in files]
-    labels = _attributes(source, "list_attr_celeba", names) or {}
-    identities = _owners_list(source, "identity_CelebA")
-    if identities is not None:
-        labels["identity"] = text_column(identities.rows.get(name, [""])[0] for name in names)
+    labels, partition = _attributes(source, "list_attr_celeba", names), None
+    if (listed := _owners_list(source, "identity_CelebA")) is not None:
+        labels["identity"] = text_column(listed.rows.get(name, [""])[0] for name in names)
+    meaning = " of 0 (train), 1 (validation) or 2 (test)"
+    if (listed := _owners_list(source, "list_eval_partition", tuple(_PARTITIONS), meaning)) is not None:
+        partition = text_column(_PARTITIONS.get(listed.rows.get(name, [""])[0], "") for name in names)
     boxes = _face_boxes(source, names) if wild and not aligned else None
-    return Table(files, labels, _partition(source, names), boxes)
+    return Table(files, labels, partition, boxes)
 
 
 def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
@@ -167,7 +158,8 @@ def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 
     if landmarks is None:
         raise ValueError(
             f"{source.path} holds CelebA's images in the wild (img_celeba), but no "
-            f"list_landmarks_celeba.txt, which says where faces are. The owners publish it at {CELEBA_HOME}. "
+            "list_landmarks_celeba.txt, which says where faces are. "
+            f"The owners publish it at {TOLD['celeba']['home']}. "
             f"A list of your own may stand in for it: {BOX_LIST}, with rows of file,{','.join(_SIZED)}"
         )
     points = landmarks.numbers(_EYES_AND_MOUTH, names).reshape(-1, 4, 2)
@@ -214,10 +206,8 @@ def parts_of(source: Source) -> dict[str, dict[int, str]]:
 
 
 def _mask_images(source: Source) -> tuple[str, ...]:
-    found = [
-        [file for file in source.images if parent_name(file) == name] for name in ("CelebA-HQ-img", "images")
-    ]
-    return tuple(found[0] or found[1])
+    published = tuple(file for file in source.images if parent_name(file) == "CelebA-HQ-img")
+    return published or tuple(file for file in source.images if parent_name(file) == "images")
 
 
 def _mask_names(source: Source, images: Sequence[str]) -> list[str]:
@@ -233,38 +223,23 @@ def _mask_names(source: Source, images: Sequence[str]) -> list[str]:
     return names
 
 
-def _is_celebamask(source: Source) -> bool:
+def is_celebamask(source: Source) -> bool:
     files = _mask_images(source)
     return bool(files) and sum(map(bool, _mask_names(source, files))) >= MOSTLY * len(files)
 
 
-def _load_celebamask(source: Source) -> Table | None:
+def load_celebamask(source: Source) -> Table | None:
     """The label ``mask`` names each mask ("" for none); attributes and parts where their lists are there."""
     files = _mask_images(source)
     masks = _mask_names(source, files)
     if not any(masks):
         return None
     names = [base_name(file) for file in files]
-    attributes, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
+    labels, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
     if (mapping := source.named(_MAPPING)) is not None:
         expected, header = "idx orig_idx orig_file, as in 0 119613 119614.jpg", r"idx\s+orig_idx\s+orig_file"
         rows = read_list(source, mapping, r"(\d+)\s+\S+\s+(\d+)(?:\.\w+)?", expected, header)
         origins = {f"{int(number)}.jpg": int(origin) for _, (number, origin) in rows}
         numbers = [origins.get(name, 0) for name in names]
-        partition = text_column(
-            next((part for part, first in _FIRST_NUMBERS.items() if number >= first), "")
-            for number in numbers
-        )
-    return Table(files, {"mask": text_column(masks), **(attributes or {})}, partition)
-
-
-CELEBA = Layout(
-    "celeba", "CelebA: faces with 40 attributes", _is_celeba, _load_celeba,
-    "list_attr_celeba.txt and img_align_celeba or img_celeba, unpacked",
-    CELEBA_HOME, "non-commercial research only", "list_eval_partition.txt",
-)  # fmt: skip
-CELEBAMASK = Layout(
-    "celebamask", "CelebAMask-HQ: faces with masks of their parts", _is_celebamask, _load_celebamask,
-    "CelebA-HQ-img/0.jpg with CelebAMask-HQ-mask-anno/0/00000_skin.png, or images/0.jpg with masks/0.png",
-    MASK_HOME, "non-commercial research and education only", _MAPPING,
-)  # fmt: skip
+        partition = _IN_ORDER[np.searchsorted(_FIRST_NUMBERS, numbers, "right")]
+    return Table(files, {"mask": text_column(masks), **labels}, partition)

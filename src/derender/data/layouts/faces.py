@@ -24,11 +24,10 @@ import numpy as np
 
 from derender.data.layouts.layout import (
     PARTITION_NAMES,
+    TOLD,
     Labels,
-    Layout,
     Table,
     base_name,
-    mostly,
     number_column,
     parent_name,
     read_csv,
@@ -40,23 +39,18 @@ from derender.data.layouts.rendered import track_labels
 from derender.data.source import Source
 
 # In a few published names the race is missing, in one the gender.
-_UTK_NAME = re.compile(r"(?P<age>\d{1,3})_(?P<gender>\d?)_(?:(?P<race>\d)_)?\d{8,}")
+UTK_NAME = re.compile(r"(?P<age>\d{1,3})_(?P<gender>\d?)_(?:(?P<race>\d)_)?\d{8,}")
 _UTK_CODES = {"gender": ("male", "female"), "race": ("white", "black", "asian", "indian", "other")}
 _UTK_OLDEST = 116
-_UTK_HOME = "https://susanqq.github.io/UTKFace/"
 
-_YALE_NAME = re.compile(r"(?P<identity>yaleB\d+)_(?P<pose>P\d\d)A(?P<a>[+-]\d+)E(?P<e>[+-]\d+)\.\w+")
-_YALE_HOME = "http://vision.ucsd.edu/~iskwak/ExtYaleDatabase/ExtYaleB.html"
-_LFW_NAME = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P=identity)_\d{4}\.\w+")
+YALE_NAME = re.compile(r"(?P<identity>yaleB\d+)_(?P<pose>P\d\d)A(?P<a>[+-]\d+)E(?P<e>[+-]\d+)\.\w+")
+LFW_NAME = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P=identity)_\d{4}\.\w+")
 _LFW_PARTS = {"peopleDevTrain.txt": "train", "peopleDevTest.txt": "test"}
-_LFW_HOME = "https://vis-www.cs.umass.edu/lfw/"
 
 _RAF_LISTS = ("list_patition_label.txt", "list_partition_label.txt")
-_RAF_HOME = "http://www.whdeng.cn/raf/model1.html"
 EMOTIONS = ("surprise", "fear", "disgust", "happiness", "sadness", "anger", "neutral")
 """In the owners' order: 1 is surprise, 7 neutral."""
 
-_TRACKS_HOME = "https://github.com/makarandtapaswi/BallClustering_ICCV2019"
 _TRACKS_HEADER = "CVHCI_TRACKLABELS_V1"
 _NUMBERED = re.compile(
     r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>(?:track[_-]?)?\d+)/(?:frame[_-]?)?\d[\d._-]*\.\w+"
@@ -64,9 +58,9 @@ _NUMBERED = re.compile(
 _NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
 
-def _load_utkface(source: Source) -> Table | None:
+def load_utkface(source: Source) -> Table | None:
     """Age, gender and race from the names; values outside the published codes count as unknown."""
-    found = [_UTK_NAME.match(base_name(file)) for file in source.images]
+    found = [UTK_NAME.match(base_name(file)) for file in source.images]
     if source.images and not any(found):
         return None
     ages = [float(one["age"]) if one else np.nan for one in found]
@@ -77,9 +71,9 @@ def _load_utkface(source: Source) -> Table | None:
     return Table(source.images, labels)
 
 
-def _load_yale(source: Source) -> Table:
+def load_yale(source: Source) -> Table:
     """Person, pose and light from the names; ``light_deg`` is the angle between light and view."""
-    found = {file: match for file in source.images if (match := _YALE_NAME.fullmatch(base_name(file)))}
+    found = {file: match for file in source.images if (match := YALE_NAME.fullmatch(base_name(file)))}
     azimuth, elevation = (np.array([float(one[name]) for one in found.values()]) for name in ("a", "e"))
     cosine = np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))
     labels = {name: text_column(one[name] for one in found.values()) for name in ("identity", "pose")}
@@ -88,7 +82,7 @@ def _load_yale(source: Source) -> Table:
     return Table(tuple(found), labels)
 
 
-def _load_lfw(source: Source) -> Table | None:
+def load_lfw(source: Source) -> Table | None:
     """Identity from the folder; emotion from ``emotions.csv`` (file, emotion) where there is one."""
     files = source.images
     if not all("/" in file for file in files):
@@ -111,15 +105,15 @@ def _load_lfw(source: Source) -> Table | None:
     return Table(files, labels, partition)
 
 
-def _raf_list(source: Source) -> str | None:
+def raf_list(source: Source) -> str | None:
     """The list of the basic set, shallowest first, or None."""
     found = [file for file in source.files if file.endswith(_RAF_LISTS) and "compound" not in file.split("/")]
     return min(found, key=lambda file: (file.count("/"), file), default=None)
 
 
-def _load_rafdb(source: Source) -> Table | None:
+def load_rafdb(source: Source) -> Table | None:
     """Emotions from the owners' list, the part from an image's name."""
-    file = _raf_list(source)
+    file = raf_list(source)
     files = tuple(name for name in source.images if stem_of(name).endswith("_aligned"))
     if file is None or not files:
         return None
@@ -137,14 +131,13 @@ def _load_rafdb(source: Source) -> Table | None:
     )
 
 
-def _is_tracks(source: Source) -> bool:
+def is_tracks(source: Source) -> bool:
     """A list of tracks, or numbered frames in numbered tracks throughout, of two people or more."""
     if _track_lists(source):
         return bool(source.images)
-    if not all(map(_NUMBERED.fullmatch, source.images)):
-        return False
-    people = {match["identity"] for file in source.images if (match := _NUMBERED.fullmatch(file))}
-    return len(people - PARTITION_NAMES.keys()) > 1
+    matches = [match for file in source.images if (match := _NUMBERED.fullmatch(file))]
+    people = {match["identity"] for match in matches} - PARTITION_NAMES.keys()
+    return len(matches) == len(source.images) and len(people) > 1
 
 
 def _track_lists(source: Source) -> dict[str, str]:
@@ -153,7 +146,7 @@ def _track_lists(source: Source) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def _load_tracks(source: Source) -> Table | None:
+def load_tracks(source: Source) -> Table | None:
     """Identity, track (unique in the whole set) and frame, by lists or by folders."""
     files, lists = source.images, _track_lists(source)
     if lists:
@@ -164,7 +157,8 @@ def _load_tracks(source: Source) -> Table | None:
 
 
 def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
-    expected = f"a first line {_TRACKS_HEADER}, then a track's number and a name a line, as at {_TRACKS_HOME}"
+    home = TOLD["face_tracks"]["home"]
+    expected = f"a first line {_TRACKS_HEADER}, then a track's number and a name a line, as at {home}"
     people: dict[tuple[str, int], str] = {}
     for episode, file in lists.items():
         for line, (number, name) in read_list(source, file, r"(\d+) +(.+)", expected, _TRACKS_HEADER):
@@ -173,49 +167,10 @@ def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
     rows = []
     for file in source.images:
         folders = file.split("/")[:-1]
-        episode = next((name for name in lists if name in folders), "")
-        if len(lists) == 1:
-            (episode,) = lists
-        number = folders[-1] if folders else ""
+        episode = next((name for name in lists if name in folders or len(lists) == 1), "")
+        known, number = ("", ""), folders[-1] if folders else ""
         if episode and number.isdecimal() and number.isascii():
-            track = int(number)
-            rows.append((people.get((episode, track), ""), f"{episode}/{track}", episode))
-        else:
-            rows.append(("", "", episode))
-    columns = dict(
-        zip(("identity", "track", "episode"), map(text_column, zip(*rows, strict=True)), strict=True)
-    )
-    return {**columns, "frame": text_column(map(stem_of, source.images))}
-
-
-UTKFACE = Layout(
-    "utkface", "UTKFace: faces with age, gender and race in their names",
-    lambda source: mostly(_UTK_NAME, [base_name(file) for file in source.images]), _load_utkface,
-    "images named [age]_[gender]_[race]_[date].jpg",
-    _UTK_HOME, "non-commercial research only",
-)  # fmt: skip
-YALE = Layout(
-    "yaleb", "Extended Yale B, cropped: faces under known light",
-    lambda source: mostly(_YALE_NAME, [base_name(file) for file in source.images]), _load_yale,
-    "images named yaleB01_P00A+035E-20.pgm",
-    _YALE_HOME, "free for research", fit="room",
-)  # fmt: skip
-LFW = Layout(
-    "lfw", "Labeled Faces in the Wild: one folder per person",
-    lambda source: mostly(_LFW_NAME, source.images), _load_lfw,
-    "every image in the folder of a person",
-    _LFW_HOME, "no licence stated; news photographs, collected for research", "peopleDevTrain.txt",
-)  # fmt: skip
-RAFDB = Layout(
-    "rafdb", "RAF-DB: faces with one of seven emotions",
-    lambda source: _raf_list(source) is not None, _load_rafdb,
-    "EmoLabel/list_patition_label.txt (spelt so) and Image/aligned/train_00001_aligned.jpg, unpacked",
-    _RAF_HOME, "non-commercial research only, on request",
-)  # fmt: skip
-FACE_TRACKS = Layout(
-    "face_tracks",
-    "face tracks: NAME.ids and NAME/TRACK/FRAME (Buffy, Big Bang Theory), or IDENTITY/TRACK/FRAME",
-    _is_tracks, _load_tracks,
-    "NAME.ids with some image in NAME/NUMBER/, or every image in IDENTITY/TRACK/",
-    _TRACKS_HOME, "lists for research; frames are the broadcasters', to be cut from one's own copy",
-)  # fmt: skip
+            known = people.get((episode, int(number)), ""), f"{episode}/{int(number)}"
+        rows.append((*known, episode, stem_of(file)))
+    columns = np.array(rows, np.str_).reshape(-1, 4).T
+    return dict(zip(("identity", "track", "episode", "frame"), columns, strict=True))

@@ -10,9 +10,11 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import yaml
 from jaxtyping import Float32
 
 from derender.data.source import Skipped, Source
@@ -26,6 +28,9 @@ PARTITION_NAMES = {
     **dict.fromkeys(("test", "testing", "eval"), "test"),
 }
 """What people call the parts of a split, and what they are called here."""
+
+TOLD = yaml.safe_load(Path(__file__).with_name("layouts.yaml").read_text(encoding="utf-8"))
+"""What is told of each layout, by its name."""
 
 MOSTLY = 0.9
 """Share of the images that must look right for a layout to be recognised: real sets hold a few odd names."""
@@ -60,10 +65,10 @@ class Layout:
     """One row of ``LAYOUTS``."""
 
     name: str  # what the user writes to ask for this layout
-    title: str  # what it is, in a few words
     # whether a source looks like it, from the names of its files (and a header line)
     recognise: Callable[[Source], bool]
     load: Callable[[Source], Table | None]  # every image with its labels; None where nothing is laid out so
+    title: str  # what it is, in a few words
     expected: str = ""  # which files there must be, for messages
     home: str = ""  # where the owners publish it; "" for layouts without owners
     terms: str = ""  # on what terms the owners give it, in a few words; "" for layouts without owners
@@ -158,9 +163,10 @@ def parent_name(file: str) -> str:
     return file.rpartition("/")[0].rpartition("/")[2]
 
 
-def mostly(pattern: re.Pattern[str], names: Sequence[str]) -> bool:
+def mostly(pattern: re.Pattern[str], names: Iterable[str]) -> bool:
     """Whether nearly all of the names, and at least one, begin with the pattern."""
-    return bool(names) and sum(1 for name in names if pattern.match(name)) >= MOSTLY * len(names)
+    matches = [pattern.match(name) is not None for name in names]
+    return bool(matches) and sum(matches) >= MOSTLY * len(matches)
 
 
 def partition_by_folder(file: str) -> str:

@@ -29,7 +29,6 @@ from derender.data.layouts.layout import (
     MOSTLY,
     PARTITION_NAMES,
     Labels,
-    Layout,
     Table,
     header_of,
     number_column,
@@ -134,7 +133,7 @@ def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) ->
     return labels
 
 
-def _load_rendered(source: Source) -> Table | None:
+def load_rendered(source: Source) -> Table | None:
     """The images beside every params.csv; their masks of parts, if they have such, as the label ``mask``."""
     folders = rendered_folders(source)
     if not folders:
@@ -149,13 +148,22 @@ def _load_rendered(source: Source) -> Table | None:
     return Table(files, labels, partition_column(parent_name(file.rpartition("/")[0]) for file in files))
 
 
-def _columns(source: Source) -> list[str]:
+def is_synface(source: Source) -> bool:
+    """Whether the first params.csv is about faces: cars have a class."""
+    return "file" in (found := columns(source)) and "class" not in found
+
+
+def columns(source: Source) -> list[str]:
     """The columns of the first params.csv, none without any."""
     folders = rendered_folders(source)
     return header_of(source, f"{folders[0]}params.csv") if folders else []
 
 
-def _load_tracks(source: Source) -> Table | None:
+def is_tracks(source: Source) -> bool:
+    return bool(source.images) and all(map(_TRACK.fullmatch, source.images))
+
+
+def load_tracks(source: Source) -> Table | None:
     """Identity and track from the folders, everything else from params.csv where it is there."""
     matches = [match for file in source.images if (match := _TRACK.fullmatch(file))]
     if len(matches) < len(source.images):
@@ -165,13 +173,13 @@ def _load_tracks(source: Source) -> Table | None:
     return Table(source.images, labels | track_labels(source.images, matches))
 
 
-def _is_paired(source: Source) -> bool:
+def is_paired(source: Source) -> bool:
     """Every image in a folder ``image`` has its depth map, and there is at least one."""
     images = _images_in(source, "image")
     return bool(images) and len(pairs_of(source)) == len(images)
 
 
-def _load_pairs(source: Source) -> Table:
+def load_pairs(source: Source) -> Table:
     """The images without their maps, with the owners' split where the folders give one."""
     files = tuple(pairs_of(source))
     around = (parent_name(file.rpartition("/")[0]).lower() for file in files)
@@ -184,13 +192,13 @@ def _table_of(source: Source) -> str | None:
     return next((file for file in candidates if "fullId" in header_of(source, file)), None)
 
 
-def _is_cars(source: Source) -> bool:
+def is_cars(source: Source) -> bool:
     files = source.images
     ours = _table_of(source) is not None or any(_CARS in file.split("/") for file in files[:1])
     return ours and bool(files) and sum(1 for file in files if _ID.search(file)) >= MOSTLY * len(files)
 
 
-def _load_cars(source: Source) -> Table | None:
+def load_cars(source: Source) -> Table | None:
     files = tuple(file for file in source.images if not _MAPS & set(file.split("/")[:-1]))
     models = [found[0] if (found := _ID.search(file)) else "" for file in files]
     partition = partition_column(map(partition_by_folder, files))
@@ -227,32 +235,3 @@ def car_class(*texts: str) -> str:
         if re.search(rf"\b({'|'.join(words)})s?\b", text):
             return kind
     return ""
-
-
-SYNCAR = Layout(
-    "syncar", "rendered cars with exact factors",
-    lambda source: "class" in _columns(source), _load_rendered,
-    "params.csv with images in a folder images beside it", default_parts=("train",),
-)  # fmt: skip
-SYNFACE = Layout(
-    "synface", "rendered faces with exact factors",
-    lambda source: "file" in (columns := _columns(source)) and "class" not in columns,
-    _load_rendered,
-    "params.csv with images in a folder images beside it", default_parts=("train",),
-)  # fmt: skip
-SYNFACE_TRACKS = Layout(
-    "synface_tracks", "rendered tracks: tracks/IDENTITY/TRACK/FRAME",
-    lambda source: bool(source.images) and all(map(_TRACK.fullmatch, source.images)), _load_tracks,
-    "every image in tracks/IDENTITY/TRACK/",
-)  # fmt: skip
-DEPTH_PAIRS = Layout(
-    "depth_pairs", "images and depth maps: image/NAME.png, depth/NAME.png", _is_paired, _load_pairs,
-    "image/NAME.png and depth/NAME.png",
-    "https://github.com/elliottwu/unsup3d", "see its owners' page",
-)  # fmt: skip
-SHAPENET_CARS = Layout(
-    "shapenet_cars", "ShapeNet cars, rendered: train, val and test, model ids in the names",
-    _is_cars, _load_cars, "folders train, val and test, or ids of 24 to 32 hexadecimal digits in the names",
-    "https://github.com/elliottwu/unsup3d",
-    "models: ShapeNet's terms, non-commercial research and education only", "a folder train, val or test",
-)  # fmt: skip

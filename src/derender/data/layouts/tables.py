@@ -22,7 +22,6 @@ import numpy as np
 
 from derender.data.layouts.layout import (
     PARTITION_NAMES,
-    Layout,
     Table,
     header_of,
     number_column,
@@ -71,7 +70,7 @@ def _table_of(source: Source) -> str | None:
     return source.table if isinstance(source, TableSource) else source.named(*_NAMES)
 
 
-def _is_listed(source: Source) -> bool:
+def is_listed(source: Source) -> bool:
     """Whether there is a table with a column of paths: a metadata.csv may be about something else."""
     file = _table_of(source)
     if isinstance(source, TableSource) or file is None or not source.images:
@@ -82,7 +81,7 @@ def _is_listed(source: Source) -> bool:
         return stem_of(file) == "data"
 
 
-def _load_listed(source: Source) -> Table | None:
+def load_listed(source: Source) -> Table | None:
     """The rows whose image is there; those whose image is not are listed as skipped."""
     if (file := _table_of(source)) is None:
         return None
@@ -182,10 +181,3 @@ def _not_cells(schema: Any) -> list[str]:
 
 def _text(cell: object) -> str:
     return "" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else str(cell)
-
-
-TABLE = Layout(
-    "table", "a table of paths and labels (CSV or Parquet)", _is_listed, _load_listed,
-    f"a table of its images: {', '.join(_NAMES)}",
-    split_from="a column split in the table",
-)  # fmt: skip

@@ -94,9 +94,6 @@ class Grid(NamedTuple):
     chart: ndarray
     surface: Surface
 
-    def moved(self, by: Sequence[float]) -> "Grid":
-        return self._replace(points=self.points + np.asarray(by, float))
-
 
 def both(grids: Sequence[Grid]) -> list[Grid]:
     """The pieces, and those on the other side of x = 0."""

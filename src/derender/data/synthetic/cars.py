@@ -231,7 +231,7 @@ def build_car(car: CarTraits) -> TriangleMesh:
             z, y = np.meshgrid([-1.1, 0.0, 1.1], [0.8, 1.2])
             out = half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
             houses = [wheel_house(out - 0.25, at, s, flank, black)]
-        pieces += both([template.moved((out, 0, at)), *houses])
+        pieces += both([template._replace(points=template.points + np.array((out, 0.0, at))), *houses])
     ahead, tall = (0.1, 0.15) if car.style in ("van", "cab") else (0.28, 0.08)
     at, own = s.cowl_at + ahead, Surface(car.trim if car.plastic else car.paint)
     mirror = half_width(flank, at, s.cowl - 0.05) + 0.09, s.cowl + 0.02 + tall, at

@@ -7,7 +7,6 @@ it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -159,17 +158,6 @@ class CarViewSettings(Settings):
     shift_sd: float = Field(default=0.003, ge=0, le=0.1)
 
 
-@dataclass(frozen=True)
-class DrawnEffects:
-    """What ``EffectSettings`` draw for one image: arrays as in ``lighting.Lighting``, and the same as labels;
-    ``more_lamps`` are (K, 4): strength, and unit direction in the canonical frame."""
-
-    gloss: ndarray
-    haze: ndarray
-    more_lamps: ndarray
-    labels: dict[str, int | float | np.float32 | str]
-
-
 class EffectSettings(Settings):
     """What light does beyond one lamp on a matt surface; by default nothing. Ranges are uniform, and even in
     the logarithm for exponent and beta. Further lamps have 0.3 to 1 of the first one's strength."""
@@ -186,8 +174,14 @@ class EffectSettings(Settings):
     def any(self) -> bool:
         return self.shadows or self.lamps > 1 or self.gloss[1] > 0 or self.haze[1] > 0
 
-    def draw(self, generator: np.random.Generator, strength: float) -> DrawnEffects:
-        """The effects of one image; ``strength`` is its first lamp's. Settings change no other draw."""
+    def draw(
+        self, generator: np.random.Generator, strength: float
+    ) -> tuple[ndarray, ndarray, ndarray, dict[str, Any]]:
+        """Gloss and haze of one image as in ``lighting.Lighting``, further lamps (K, 4), and labels of all.
+
+        A lamp is its strength, and a unit direction in the canonical frame. ``strength`` is that of the first
+        lamp. Settings change no other draw.
+        """
         share, lamps = generator.random(4), generator.random((3, 3))
         gloss = np.array([drawn(self.gloss, share[0]), _even_in_log(self.exponent, share[1])], np.float32)
         haze = np.array([_even_in_log(self.haze, share[2]), drawn(self.airlight, share[3])], np.float32)
@@ -204,7 +198,7 @@ class EffectSettings(Settings):
         angles = np.rad2deg(np.stack([pitch, yaw], axis=1)).astype(np.float32)
         for n, (force, own) in enumerate(zip(power[:, 0].astype(np.float32), angles, strict=True), 2):
             labels |= {f"lamp{n}": force, f"lamp{n}_pitch": own[0], f"lamp{n}_yaw": own[1]}
-        return DrawnEffects(gloss, haze, np.hstack([power, rows]), labels)
+        return gloss, haze, np.hstack([power, rows]), labels
 
 
 def _even_in_log(ends: Range, share: float) -> float:

@@ -85,11 +85,6 @@ class SyntheticSet:
         """Name of each face's expression."""
         return self.labels["expression"]
 
-    @property
-    def strength(self) -> Shaped[ndarray, "n"]:
-        """How strongly each expression shows."""
-        return self.labels["strength"]
-
 
 class Shot(NamedTuple):
     """One image before it is drawn; ``light``, ``camera`` and the rest as in SyntheticSet."""
@@ -151,16 +146,17 @@ def make_set(
         rays = np.hstack([light[:, 1:2], direction]).astype(np.float32)
         generators = [np.random.default_rng([seed, 5, index]) for index in indices]
         drawn = [effects.draw(own, float(ray[0])) for own, ray in zip(generators, rays, strict=True)]
-        for n, (index, shot, own) in enumerate(zip(indices, run, drawn, strict=True)):
+        rows = []
+        for n, (index, shot, (gloss, haze, more, labels)) in enumerate(zip(indices, run, drawn, strict=True)):
             out = ImageMaps(*(each[index - first] for each in maps))
             turn, shift = rotation[n].astype(np.float32), camera[n, 3:]
-            more = np.hstack([own.more_lamps[:, :1], own.more_lamps[:, 1:] @ turn.T])
+            more = np.hstack([more[:, :1], more[:, 1:] @ turn.T])
             lamps = np.vstack([rays[n], more]).astype(np.float32)
-            lit = (float(light[n, 0]), lamps, own.gloss, own.haze, effects.shadows, image_size)
+            lit = (float(light[n, 0]), lamps, gloss, haze, effects.shadows, image_size)
             lighting = lit_by(shot.mesh, turn, shift, *lit)
             draw_mesh(shot.mesh, turn, shift, lighting, shot.background, focal, out)
-        shown = zip(run, drawn, strict=True)
-        return [(*shot[2:5], shot.labels | own.labels, shot.traits) for shot, own in shown]  # without meshes
+            rows.append((*shot[2:5], shot.labels | labels, shot.traits))  # without meshes
+        return rows
 
     whole = per_object * max(1, _LONGEST_RUN // per_object)  # objects where they fit
     runs = groupby(range(first, first + count), lambda i: (i // whole, i % whole // _LONGEST_RUN))

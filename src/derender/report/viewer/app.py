@@ -25,7 +25,6 @@ from starlette.routing import Route
 from derender import __version__
 from derender.data import read_photo
 from derender.features import FeatureTable
-from derender.inputs import require_fitting
 from derender.model import Derenderer
 from derender.report.colours import pictures
 from derender.report.opening import held_out_errors, readable
@@ -105,7 +104,7 @@ def open_viewer(
         fit_steps, frame: as ``Studio`` takes them.
     """
     if fit_steps:
-        require_fitting(model, source)
+        model.features.required_fitting(source)
     gallery = None
     if table is not None:
         if not set(table.factors) & set(model.nets):
