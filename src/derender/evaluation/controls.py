@@ -12,7 +12,6 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +33,6 @@ from derender.data import ImageSet
 from derender.evaluation.feature_rows import (
     FeatureRow,
     FeatureSource,
-    cached_table,
     check_rows,
     embedded_table,
     is_model,
@@ -46,7 +44,7 @@ from derender.features import FeatureTable, model_fingerprint
 from derender.inputs import Progress, as_images, as_model, device_named
 from derender.model import Derenderer
 from derender.postprocess import Features
-from derender.postprocess.whitening import Projection, Whitening
+from derender.postprocess.whitening import Whitening
 from derender.presets import ModelSettings
 from derender.training.config import FeatureSettings, TrainConfig
 from derender.training.features import Describe, fit_whitening
@@ -104,11 +102,11 @@ def control_rows(
     inputs = {"images": images.images, "components": components}
     if fit_on is not None:
         inputs["fit_on"] = fit_on.images
-    pca = cached_table(
-        options.memory, "pca", inputs, images,
-        lambda: dict(pca_features(images, components=components, fit_on=fitted).factors),
-    )  # fmt: skip
-    rows.append(FeatureRow(f"PCA ({components})", (pca,), control=True))
+    pca = options.memory.recall_one(
+        "pca", inputs, lambda: pca_features(images, components=components, fit_on=fitted).factors["pca"]
+    )
+    table = control_table(images, "pca", pca, {"components": components})
+    rows.append(FeatureRow(f"PCA ({components})", (table,), control=True))
     options.notes.append(
         f"PCA ({components}), whitened, is fitted to {len(fitted):,} images of {fitted.source}"
     )
@@ -221,20 +219,14 @@ class Renderings:
         """Principal components of the lent images, whitened by their renderings: factor ``pca``."""
         count = self.n_components
         pca = PCA(count, random_state=0).fit(flat_pixels(self.images))
-        mean = torch.from_numpy(pca.mean_).float()
-        components: Any = pca.components_
-        axes = torch.from_numpy(components.T.copy()).float()
-
-        def projected(flat: Float[Tensor, "n pixel"]) -> Float[Tensor, "n component"]:
-            return (flat - mean) @ axes
 
         def described(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-            return {"pca": projected(batch.detach().cpu().float().flatten(1))}
+            return {"pca": torch.from_numpy(pca.transform(batch.numpy(force=True).reshape(len(batch), -1)))}
 
         whitening = self._fitted(described, f"pca {count} None", progress)
         views = [images.images, images.images[..., ::-1]] if whitening.mirrored else [images.images]
-        codes = torch.cat([projected(torch.from_numpy(flat_pixels(one))) for one in views], dim=1)
-        origin = {"control": "pca", "components": count, "whitened": True, "fitted_on": len(self.images)}
+        codes = torch.cat([torch.from_numpy(pca.transform(flat_pixels(one))) for one in views], dim=1)
+        origin = {"components": count, "whitened": True, "fitted_on": len(self.images)}
         return control_table(images, "pca", whitening({"pca": codes})["pca"].numpy(), origin)
 
     def _fitted(
@@ -255,12 +247,7 @@ class Renderings:
             return {name: value.cpu().numpy() for name, value in found.named_buffers()}
 
         arrays = self.memory.recall("lent whitening", inputs, make)
-        names = [name.removesuffix("_map") for name in arrays if name.endswith("_map")]
-        contrasts = {}
-        for name in names:
-            parts = (arrays[f"{name}_{part}"] for part in ("mean", "map", "ratios"))
-            contrasts[name] = Projection(*map(torch.from_numpy, parts))
-        return Whitening(contrasts, mirrored=names if settings.whitening.mirrored else ())
+        return Whitening.of({name: torch.from_numpy(values) for name, values in arrays.items()})
 
 
 def _whitening_settings(model: Derenderer) -> FeatureSettings:
