@@ -24,7 +24,7 @@ from derender.evaluation.bootstrap import (
     scored_row,
     with_verdicts,
 )
-from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch_hierarchy
+from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
     METRICS,
@@ -272,7 +272,7 @@ def finch_levels(features: np.ndarray, labels: np.ndarray, memory: Memory | None
     """
     labels = np.asarray(labels)
     known = ~missing(labels)
-    hierarchy = finch_hierarchy(np.asarray(features)[known], memory)
+    hierarchy = finch(np.asarray(features)[known], memory)
     counted = zip(hierarchy.counts, hierarchy.partitions, strict=True)
     own = labels[known]
     return tuple(Level(count, cluster_scores(own, one), chance_scores(own, one)) for count, one in counted)

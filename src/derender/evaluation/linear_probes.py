@@ -89,7 +89,7 @@ def probe(
         "seeds": list(seeds), "settings": settings.model_dump() if papers else {},
     }  # fmt: skip
 
-    def answers(own: np.ndarray, seed: int) -> np.ndarray:
+    def learned(own: np.ndarray, seed: int) -> np.ndarray:
         if head == "k-NN":
             return nearest_answers(features[own], targets[own], features[tested])
         weight, bias, _ = logistic_weights(features[own], targets[own], kind=kind, seed=seed)
@@ -100,8 +100,8 @@ def probe(
     def make() -> np.ndarray:
         if papers:
             how = {"kind": kind, "seeds": seeds, "settings": settings, "centred": head == "centred"}
-            return train_heads(features, targets, rows, tested, **how).astype(np.float32)
-        return np.stack([answers(*one) for one in zip(rows, seeds, strict=True)]).astype(np.float32)
+            return train_heads(features, targets, rows, tested, **how)
+        return np.stack(list(map(learned, rows, seeds))).astype(np.float32)
 
     return (memory or Memory()).recall_one(f"probe-{head}", inputs, make)
 
@@ -117,13 +117,12 @@ def probe_runs(
     memory: Memory | None,
 ) -> np.ndarray:
     """(S, T, A) answers; seed s uses run s modulo their number, and seeds that share a run learn together."""
-    answers = {}
+    answers = np.empty((len(seeds), len(tested), task.targets.shape[1]), np.float32)
     for run, array in enumerate(arrays[: len(seeds)]):
-        mine = list(range(run, len(seeds), len(arrays)))
-        own = [seeds[at] for at in mine]
-        found = probe(head, array, task, rows[mine], tested, own, settings=settings, memory=memory)
-        answers |= dict(zip(mine, found, strict=True))
-    return np.stack([answers[at] for at in range(len(seeds))])
+        mine = slice(run, None, len(arrays))
+        own = {"settings": settings, "memory": memory}
+        answers[mine] = probe(head, array, task, rows[mine], tested, seeds[mine], **own)
+    return answers
 
 
 def nearest_answers(

@@ -6,7 +6,7 @@ the first counts. Above ``EXACT_ROWS`` rows a row is compared with those of its 
 
 ``cells`` puts near rows together. Centres come from a few rounds of k-means (Lloyd 1982) over a sample; every
 row goes to its nearest centre. Cells that came out too large are divided again. Approximate by nature: rows
-on two sides of a border do not see each other. Nothing is random but for the seed.
+on two sides of a border do not see each other.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -98,13 +98,11 @@ def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return nearest, distance
 
 
-def cells(
-    points: Float32[np.ndarray, "n d"], rows_per_cell: int = CELL_ROWS, seed: int = 0
-) -> Int64[np.ndarray, " n"]:
+def cells(points: Float32[np.ndarray, "n d"], rows_per_cell: int) -> Int64[np.ndarray, " n"]:
     """The cell of each row, (N,) integers from 0 without gaps; near rows mostly share one."""
     number = np.zeros(len(points), np.int64)
     waiting, made = [np.arange(len(points))], 0
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     while waiting:
         rows = waiting.pop()
         if len(rows) <= rows_per_cell:
