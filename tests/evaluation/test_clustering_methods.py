@@ -16,7 +16,7 @@ from derender.evaluation import clustering_methods, neighbours
 from derender.evaluation.clustering import finch_levels
 from derender.evaluation.clustering_methods import clusterings, cut, finch, ward_tree
 from derender.evaluation.memory import Memory
-from derender.evaluation.neighbours import cells, finite_rows, members, nearest_rows
+from derender.evaluation.neighbours import cells, finite_rows, nearest_rows
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it says at import that its approximate search is not installed
@@ -139,7 +139,7 @@ def many(monkeypatch) -> None:
 
 @pytest.mark.parametrize("points", [groups(500, 0), np.zeros((500, 3), np.float32), groups(30, 1)])
 def test_cells_hold_every_row_once_and_are_not_too_large(points):
-    groups = members(cells(points.astype(np.float32), 40))
+    groups = cells(points.astype(np.float32), 40)
     assert sorted(np.concatenate(groups).tolist()) == list(range(len(points)))
     assert max(map(len, groups)) <= 160
     assert all((np.diff(rows) > 0).all() for rows in groups)

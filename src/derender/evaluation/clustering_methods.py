@@ -38,7 +38,6 @@ from derender.evaluation.neighbours import (
     TILE,
     cells,
     finite_rows,
-    members,
     nearest_rows,
     of_each,
     unit_rows,
@@ -125,7 +124,7 @@ def ward_in_cells(
 ) -> dict[str, np.ndarray]:
     """Approximate Ward over the rows of (N, D) features: ``tree`` and ``leaf``, as ``cut`` takes them."""
     points = finite_rows(features, "Ward clustering").astype(np.float32, copy=False)
-    groups = members(cells(points, rows_per_cell))
+    groups = cells(points, rows_per_cell)
     trees = list(of_each(lambda cell: _tree(points[groups[cell]]), groups))
     # the cheapest merges of all cells are made until so many clusters are left
     heights = np.concatenate([tree[:, 2] for tree in trees])
