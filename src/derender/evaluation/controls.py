@@ -40,6 +40,7 @@ from derender.evaluation.feature_rows import (
 )
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
+from derender.evaluation.pixels import component_count
 from derender.features import FeatureTable, model_fingerprint
 from derender.inputs import Progress, as_images, as_model, device_named
 from derender.model import Derenderer
@@ -52,7 +53,6 @@ from derender.training.features import Describe, fit_whitening
 UNTRAINED = "untrained encoder"
 MISSING_CONTROLS = "without images there are no pixels, PCA and untrained encoder to compare with"
 DEFAULT_SIZE = 64  # of the controls beside features of an unknown architecture
-COMPONENTS, LENT_COMPONENTS = 64, 256
 _SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
 
@@ -98,7 +98,7 @@ def control_rows(
         }
         rows.append(_untrained_row(UNTRAINED, twins, images, options))
     fitted = images if fit_on is None else fit_on
-    components = max(1, min(COMPONENTS, len(fitted) // 4))  # whitening needs many more rows than components
+    components = component_count(len(fitted))  # whitening needs many more rows than components
     inputs = {"images": images.images, "components": components}
     if fit_on is not None:
         inputs["fit_on"] = fit_on.images
@@ -198,7 +198,7 @@ class Renderings:
     @property
     def n_components(self) -> int:
         """256 principal components, and at most a quarter of the number of images."""
-        return max(1, min(LENT_COMPONENTS, len(self.images) // 4))
+        return component_count(len(self.images), most=256)
 
     def whiten(self, encoder: Derenderer, progress: Progress | None = None) -> Derenderer:
         """A copy of an encoder whose geometry and albedo are whitened by the renderings; its scenes stay."""

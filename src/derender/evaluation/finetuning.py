@@ -25,15 +25,16 @@ from torch import Generator, Tensor, nn
 
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, Split, split_indices
-from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference, numbers_of
-from derender.evaluation.controls import control_rows
+from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, numbers_of, with_verdicts
+from derender.evaluation.controls import UNTRAINED, control_rows
+from derender.evaluation.feature_rows import embedded_table
 from derender.evaluation.linear_probes import head_loss, probabilities
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import ScoreTable, scored_table
-from derender.features import embed_images, map_batches, model_fingerprint, named
+from derender.features import map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures
@@ -327,17 +328,17 @@ def score_finetuned(
             "bring more images, or set a larger test share in split="
         )
 
-    def answered() -> dict[str, np.ndarray]:
+    def answered() -> np.ndarray:
         parts = map_batches(tuned.predict, tuned, task.images[test], batch_size=256)
-        return {"answers": torch.cat(parts).cpu().numpy()}
+        return torch.cat(parts).cpu().numpy()
 
     inputs = {"weights": model_fingerprint(tuned), "kind": target.asked.kind, "images": task.images[test]}
-    answers = kept.recall("finetuned-answers", inputs, answered)["answers"]
-    start = (task.start if task.start is not None else task.build().model).to(tuned.device)
-    features = _features(start, task, np.concatenate([train, test]), kept)
-    count, runs = len(train), {name: [values] for name, values in features.items()}
-    rows = Rows(np.arange(count, count + len(test)), {count: np.arange(count)[None]})
-    asked = Task(target.asked.kind, target.asked.names, target.asked.targets[np.concatenate([train, test])])
+    answers = kept.recall_one("finetuned-answers", inputs, answered)
+    learned_and_tested, count = np.concatenate([train, test]), len(train)
+    start = (task.start or task.build().model).to(tuned.device)
+    runs = _features(start, task, learned_and_tested, kept)
+    asked = target.asked.select(learned_and_tested)
+    rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
     how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}
     tuned_answers = {"fine-tuned": {count: answers[None]}}
     logistic, joint = compare_linear(
@@ -346,28 +347,25 @@ def score_finetuned(
     frozen_alone = {"frozen": runs["frozen"]}
     (paper,) = compare_linear(frozen_alone, asked, rows, (seed,), heads=("linear",), **how).parts
     ours, majority = joint.rows
-    frozen, *controls = logistic.rows[: len(features)]
+    frozen, *controls = logistic.rows[:-1]
     beside = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
     beside |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
-    others = {name: row.scores for name, row in beside.items()}
-    rivals = {score: {name: scores[score] for name, scores in others.items()} for score in BOTH}
-    controls = (ScoredRow(name, True, 1, scores) for name, scores in others.items())
-    scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *controls)
-    versus = {score: difference(ours.scores[score], rivals[score]) for score in BOTH}
-    unlabelled = int((~target.asked.known).sum())
-    return FinetuneScores(scored, versus, asked.kind, asked.names, count, len(test), unlabelled)
+    others = [ScoredRow(name, True, 1, row.scores) for name, row in beside.items()]
+    scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *others)
+    versus = with_verdicts(scored)[0].versus
+    return FinetuneScores(
+        scored, {score: versus[score] for score in BOTH}, asked.kind, asked.names, count, len(test),
+        n_unlabelled=int((~target.asked.known).sum()),
+    )  # fmt: skip
 
 
-def _features(start: Any, task: FinetuneTask, rows: np.ndarray, kept: Memory) -> dict[str, np.ndarray]:
-    """(R, D) of some of the task's images: codes that training began with, and three that learned nothing."""
-
-    def codes(model: Any) -> np.ndarray:
-        inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
-        found = kept.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
-        return np.concatenate([found[name] for name in task.config.target.factors], axis=1)
-
-    parts = (rows, task.target.split.train)
+def _features(
+    start: Derenderer, task: FinetuneTask, rows: np.ndarray, kept: Memory
+) -> dict[str, list[np.ndarray]]:
+    """Of some of the task's images (R, D) codes that training began with, and three that learned nothing."""
+    parts, factors = (rows, task.target.split.train), task.config.target.factors
     shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
+    models = {"frozen": start, UNTRAINED: untrained_twin(start, task.config.seed)}
+    codes = {name: [embedded_table(one, shown, kept).concatenate(factors)] for name, one in models.items()}
     plain = control_rows(shown, None, Options(cache=kept), fit_on=fitted)
-    untrained = {"untrained encoder": codes(untrained_twin(start, task.config.seed))}
-    return {"frozen": codes(start)} | untrained | {row.name: row.arrays()[0] for row in plain}
+    return codes | {row.name: row.arrays() for row in plain}

@@ -122,9 +122,9 @@ def unpacked(kind: type[T], arrays: Mapping[str, np.ndarray]) -> T:
     def whole(one: dict[str, Any]) -> Any:
         return arrays[one["array"]] if set(one) == {"array"} else one
 
-    adapter = TypeAdapter(tuple[kind], config=ConfigDict(arbitrary_types_allowed=True))
-    (value,) = adapter.validate_python((json.loads(str(arrays["value"]), object_hook=whole),))
-    return value
+    holder: Any = tuple[kind]  # pyright: ignore[reportInvalidTypeForm]
+    adapter = TypeAdapter(holder, config=ConfigDict(arbitrary_types_allowed=True))
+    return adapter.validate_python([json.loads(str(arrays["value"]), object_hook=whole)])[0]
 
 
 def _read(file: Path) -> Arrays | None:
