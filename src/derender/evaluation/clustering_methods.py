@@ -40,7 +40,6 @@ from derender.evaluation.neighbours import (
     finite_rows,
     nearest_rows,
     of_each,
-    unit_rows,
 )
 from derender.features import named
 
@@ -288,9 +287,18 @@ def finch_clusters(
             f"FINCH's finest partition of {len(features)} rows has {hierarchy.counts[0]} clusters, "
             f"cannot make {n_clusters}: ask for 1 to {hierarchy.counts[0]}, or use Ward"
         )
-    level = max(number for number, count in enumerate(hierarchy.counts) if count >= n_clusters)
-    partition, merges = hierarchy.partitions[level], hierarchy.counts[level] - n_clusters
-    return by_appearance(_merged(features, partition, merges)[partition]) if merges else partition
+    partition = [part for part in hierarchy.partitions if part.max() + 1 >= n_clusters][-1]
+    means, sizes = _means(features, partition), np.bincount(partition)
+    while len(means) > n_clusters:
+        nearest, distance = nearest_rows(means)
+        pair = distance.argmin()
+        first, second = sorted((pair, nearest[pair]))
+        means[first] += (means[second] - means[first]) * sizes[second] / (sizes[first] + sizes[second])
+        sizes[first] += sizes[second]
+        means, sizes = np.delete(means, second, axis=0), np.delete(sizes, second)
+        partition = np.where(partition == second, first, partition)
+        partition -= partition > second
+    return by_appearance(partition)
 
 
 def _linked(rows: np.ndarray) -> np.ndarray:
@@ -304,33 +312,3 @@ def _means(features: np.ndarray, partition: np.ndarray) -> np.ndarray:
     sizes = np.bincount(partition)
     member = csr_array((np.ones(len(partition)), (partition, np.arange(len(partition)))))
     return (member @ features / sizes[:, None]).astype(features.dtype, copy=False)
-
-
-def _merged(features: np.ndarray, partition: np.ndarray, merges: int) -> np.ndarray:
-    """The cluster that each becomes when the nearest pair of means is merged so many times.
-
-    Only clusters that a merge touches look for their nearest again.
-    """
-    means, sizes = _means(features, partition), np.bincount(partition).astype(np.float64)
-    alive, into = np.ones(len(means), bool), np.arange(len(means))
-    nearest, distance = nearest_rows(means)
-    for _ in range(merges):
-        pair = int(np.where(alive, distance, np.inf).argmin())
-        first, second = sorted((pair, int(nearest[pair])))
-        means[first] += (means[second] - means[first]) * sizes[second] / (sizes[first] + sizes[second])
-        sizes[first] += sizes[second]
-        alive[second], into[into == second] = False, first
-        others = np.flatnonzero(alive)
-        if len(others) < 2:
-            break
-        touched = alive & ((nearest == first) | (nearest == second))
-        touched[first] = True
-        rows = np.flatnonzero(touched)
-        gaps = 1 - unit_rows(means[rows]) @ unit_rows(means[others]).T
-        gaps[rows[:, None] == others] = np.inf
-        at = gaps.argmin(axis=1)
-        nearest[rows], distance[rows] = others[at], gaps[np.arange(len(rows)), at]
-        gap = 1 - unit_rows(means[others]) @ unit_rows(means[[first]])[0]
-        closer = (gap < distance[others]) & (others != first)
-        nearest[others[closer]], distance[others[closer]] = first, gap[closer]
-    return into
