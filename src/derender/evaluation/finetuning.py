@@ -25,7 +25,7 @@ from torch import Generator, Tensor, nn
 
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, Split, split_indices
-from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, numbers_of, with_verdicts
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, numbers_of, with_verdicts
 from derender.evaluation.controls import UNTRAINED, control_rows
 from derender.evaluation.feature_rows import embedded_table
 from derender.evaluation.linear_probes import head_loss, probabilities
@@ -33,7 +33,7 @@ from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import ScoreTable, scored_table
+from derender.evaluation.score_table import Scores, scored_table
 from derender.features import map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
@@ -269,52 +269,20 @@ class FinetuneStep(nn.Module):
         return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))
 
 
-@dataclass(frozen=True)
-class FinetuneScores:
-    """Held-out scores of ``fine-tuned``, both heads on frozen features, logistic regression on three
-    controls, and ``majority``: accuracy, balanced_accuracy, average_precision (0..1, best 1).
-
-    ``versus`` compares the fine-tuned model with the best of the others, by score. ``n_unlabelled`` images of
-    the run have none of the labels: rendered, never asked.
-    """
-
-    rows: tuple[ScoredRow, ...]
-    versus: dict[str, Difference]
-    kind: str
-    names: tuple[str, ...]
-    n_train: int
-    n_test: int
-    n_unlabelled: int
-
-    def numbers(self) -> dict[str, Any]:
-        """Everything as JSON takes it."""
-        versus = {name: asdict(one) for name, one in self.versus.items()}
-        return {**vars(self), "rows": numbers_of(self.rows), "versus": versus}
-
-    def table(self, began: str) -> ScoreTable:
-        """A row each; ``began`` names the model whose frozen features the heads take."""
-        count = len(self.names)
-        task = f"{count} classes" if self.kind == "classes" else f"mean of {count} yes/no labels"
-        caption = (
-            f"{task}: {self.n_train:,} labelled images learned, {self.n_test:,} held out; frozen features "
-            f"of {began}"
-        )
-        if self.n_unlabelled:
-            caption += f"; {self.n_unlabelled:,} images without label never asked"
-        return scored_table(
-            caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=BOTH, deviations=()
-        )
-
-
 def score_finetuned(
     tuned: FinetunedModel,
     task: FinetuneTask,
     *,
+    began: str = "fresh weights",
     resample_count: int = RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
-) -> FinetuneScores:
-    """Score a trained model on the task's test part; what took long is kept in ``memory``.
+) -> Scores:
+    """Held-out scores of ``fine-tuned``, of heads on frozen features and of controls, 0..1, best 1.
+
+    Beside it stand both heads on the frozen features of ``began``, logistic regression on three controls, and
+    ``majority``; ``versus`` compares it with the best of these. ``n_unlabelled`` images have none of the
+    labels. ``result`` are the ``ScoredRow``; what took long is kept in ``memory``.
 
     Raises:
         ValueError: no tested image has a label.
@@ -353,10 +321,21 @@ def score_finetuned(
     others = [ScoredRow(name, True, 1, row.scores) for name, row in beside.items()]
     scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *others)
     versus = with_verdicts(scored)[0].versus
-    return FinetuneScores(
-        scored, {score: versus[score] for score in BOTH}, asked.kind, asked.names, count, len(test),
-        n_unlabelled=int((~target.asked.known).sum()),
-    )  # fmt: skip
+    notes = [versus[score].text(score) for score in BOTH]
+    unlabelled, names = int((~target.asked.known).sum()), asked.names
+    task_name = f"{len(names)} classes" if asked.kind == "classes" else f"mean of {len(names)} yes/no labels"
+    caption = (
+        f"{task_name}: {count:,} labelled images learned, {len(test):,} held out; frozen features of {began}"
+    )
+    if unlabelled:
+        caption += f"; {unlabelled:,} images without label never asked"
+    every: dict[str, Any] = {"intervals": BOTH, "deviations": ()}
+    table = scored_table(caption, "trained on labels", scored, LINEAR_COLUMNS, **every)
+    values = {
+        "rows": numbers_of(scored), "versus": {score: asdict(versus[score]) for score in BOTH},
+        "kind": asked.kind, "names": names, "n_train": count, "n_test": len(test), "n_unlabelled": unlabelled,
+    }  # fmt: skip
+    return Scores([table], values, notes, result=scored)
 
 
 def _features(
