@@ -202,20 +202,17 @@ def compare_clusterings(
 
 def _numbered(values: np.ndarray, name: str) -> np.ndarray:
     """Classes as integers from 0, -1 where missing."""
-    known = ~missing(values)
-    classes = np.full(len(values), -1, np.int64)
-    if known.any():
-        classes[known] = encoded(values[known])
-    count = int(classes.max(initial=-1)) + 1
+    classes = encoded(values)
+    known, count = int((classes >= 0).sum()), int(classes.max(initial=-1)) + 1
     if count < 2:
         raise ValueError(
-            f"clustering needs at least two classes, the {int(known.sum())} labelled rows of {name!r} have "
-            f"{count}: choose another label column"
+            f"clustering needs at least two classes, the {known} labelled rows of {name!r} have {count}: "
+            "choose another label column"
         )
-    if count == known.sum():
+    if count == known:
         raise ValueError(
-            f"every one of the {int(known.sum())} labelled rows of {name!r} is a class of its own: choose a "
-            "label column whose values repeat"
+            f"every one of the {known} labelled rows of {name!r} is a class of its own: choose a label "
+            "column whose values repeat"
         )
     return classes
 

@@ -5,6 +5,7 @@ one of tables and models, ``prepare`` the arrays that protocols take. Leaves out
 scores.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -214,11 +215,9 @@ def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndar
     LFW's protocol here is ``at_least(identity, 20, most=20)``. One of its 31 people with 20 images has 530:
     all of these would decide the purity (0.35 for any clustering at all).
     """
-    labels = np.asarray(labels)
-    present = np.flatnonzero(~missing(labels))
-    places: dict[Any, list[int]] = {}
-    for row, value in zip(present.tolist(), labels[present].tolist(), strict=True):
-        places.setdefault(value, []).append(row)
+    labels, places = np.asarray(labels), defaultdict(list)
+    for row in np.flatnonzero(~missing(labels)).tolist():
+        places[labels[row]].append(row)
     rows = [row for own in places.values() if len(own) >= count for row in own[:most]]
     if not rows:
         largest = max(map(len, places.values()), default=0)

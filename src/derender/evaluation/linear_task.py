@@ -127,24 +127,20 @@ def divide_rows(
 
 def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
     """The distinct values of a column, sorted, and (N,) their numbers, -1 where missing."""
-    known = ~missing(values)
-    distinct = sorted(set(values[known].tolist()))
+    known, numbers = ~missing(values), np.full(len(values), -1, np.int64)
+    distinct, numbers[known], counts = np.unique(values[known], return_inverse=True, return_counts=True)
     if len(distinct) < 2:
         raise ValueError(
             f"a linear probe needs at least two classes, the {int(known.sum())} labelled rows of {name!r} "
             f"have {len(distinct)}: choose another label column"
         )
-    number = {value: at for at, value in enumerate(distinct)}
-    numbers = np.full(len(values), -1, np.int64)
-    numbers[known] = [number[value] for value in values[known].tolist()]
-    counts = np.bincount(numbers[known])
     if counts.min() < 2:
         raise ValueError(
-            f"class {distinct[counts.argmin()]!r} of label {name!r} has one row, which cannot be both "
-            "learned and tested: leave this class out (where there is --min-count, give 2), or choose "
+            f"class {distinct.tolist()[counts.argmin()]!r} of label {name!r} has one row, which cannot be "
+            "both learned and tested: leave this class out (where there is --min-count, give 2), or choose "
             "another label"
         )
-    return distinct, numbers
+    return distinct.tolist(), numbers
 
 
 @dataclass(frozen=True)
