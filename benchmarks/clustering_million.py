@@ -29,7 +29,6 @@ from derender.evaluation import neighbours
 from derender.evaluation.clustering_methods import (
     clusterings,
     cut,
-    cut_leaves,
     finch,
     ward_in_cells,
     ward_tree,
@@ -87,8 +86,10 @@ def how_far(rows: int) -> dict[str, Any]:
     half = ward_tree(features[:, ::2])
     for count in (one for one in COUNTS if one <= leaves):
         exact = cut(tree, count)
-        result[f"ward_ari_{count}"] = adjusted_rand_score(cut_leaves(found, count), exact)
-        result[f"ward_ari_{count}_cells_of_2000"] = adjusted_rand_score(cut_leaves(few_leaves, count), exact)
+        result[f"ward_ari_{count}"] = adjusted_rand_score(cut(n_clusters=count, **found), exact)
+        result[f"ward_ari_{count}_cells_of_2000"] = adjusted_rand_score(
+            cut(n_clusters=count, **few_leaves), exact
+        )
         result[f"ward_ari_{count}_half_the_columns"] = adjusted_rand_score(cut(half, count), exact)
     means, nearest = clusterings(features, (CLASSES,), "k-means"), nearest_rows(features)[0]
     levels = finch(features)

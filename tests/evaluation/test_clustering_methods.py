@@ -14,9 +14,9 @@ from sklearn.metrics import adjusted_rand_score, pairwise_distances
 
 from derender.evaluation import clustering_methods, neighbours
 from derender.evaluation.clustering import finch_levels
-from derender.evaluation.clustering_methods import clusterings, cut, cut_leaves, finch, ward_tree
+from derender.evaluation.clustering_methods import clusterings, cut, finch, ward_tree
 from derender.evaluation.memory import Memory
-from derender.evaluation.neighbours import cells, finite_rows, members, nearest_rows
+from derender.evaluation.neighbours import cells, finite_rows, nearest_rows
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it says at import that its approximate search is not installed
@@ -139,7 +139,7 @@ def many(monkeypatch) -> None:
 
 @pytest.mark.parametrize("points", [groups(500, 0), np.zeros((500, 3), np.float32), groups(30, 1)])
 def test_cells_hold_every_row_once_and_are_not_too_large(points):
-    groups = members(cells(points.astype(np.float32), 40))
+    groups = cells(points.astype(np.float32), 40)
     assert sorted(np.concatenate(groups).tolist()) == list(range(len(points)))
     assert max(map(len, groups)) <= 160
     assert all((np.diff(rows) > 0).all() for rows in groups)
@@ -160,11 +160,11 @@ def test_ward_by_cells_is_ward_where_no_merge_crosses_a_border():
     points = groups(600, 5, count=6, apart=30)
     found = clustering_methods.ward_in_cells(points, leaves=60, rows_per_cell=100)
     exact = ward_tree(points)
-    assert is_valid_linkage(exact) and len(np.unique(found.leaf)) == len(found.tree) + 1 == 60
+    assert is_valid_linkage(exact) and len(np.unique(found["leaf"])) == len(found["tree"]) + 1 == 60
     for count in (2, 4, 6):
-        assert adjusted_rand_score(cut_leaves(found, count), cut(exact, count)) == 1
-    with pytest.raises(ValueError, match="keeps 60 leaves of 600 rows, cannot make 61 clusters: ask"):
-        cut_leaves(found, 61)
+        assert adjusted_rand_score(cut(n_clusters=count, **found), cut(exact, count)) == 1
+    with pytest.raises(ValueError, match="cannot make 61 clusters of 60 leaves"):
+        cut(n_clusters=61, **found)
 
 
 @pytest.mark.parametrize("method", ["ward", "finch", "k-means"])

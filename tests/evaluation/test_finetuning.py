@@ -119,18 +119,18 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
     tuned, first, second = load_finetuned(tmp_path / "run"), Memory(tmp_path / "m"), Memory(tmp_path / "m")
     found = finetuning.score_finetuned(tuned, one, resample_count=50, memory=first)
     again = finetuning.score_finetuned(tuned, one, resample_count=50, memory=second)
-    assert str(again.numbers()) == str(found.numbers()) and found.n_unlabelled == 0
+    assert str(again.values) == str(found.values) and found.values["n_unlabelled"] == 0
     assert (second.made, second.recalled) == (0, first.made) and first.made == 9
     targets = one.target.asked.targets.copy()
     targets[one.target.split.train[:3]] = -1
     fewer = replace(one, target=replace(one.target, asked=replace(one.target.asked, targets=targets)))
     some = finetuning.score_finetuned(tuned, fewer, resample_count=50, memory=second)
-    assert some.n_unlabelled == 3 and "3 images without label" in some.table("fresh").caption
-    rows = {row.name: row.scores["balanced_accuracy"].value for row in found.rows}
+    assert some.values["n_unlabelled"] == 3 and "3 images without label" in some.tables[0].caption
+    rows = {row.name: row.scores["balanced_accuracy"].value for row in found.result}
     assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
-    assert (found.kind, found.n_train, found.n_test) == ("labels", 24, 24)
-    assert found.versus["accuracy"].rival != "fine-tuned"
-    table = found.table("fresh weights").values()
+    assert [found.values[name] for name in ("kind", "n_train", "n_test")] == ["labels", 24, 24]
+    assert found.values["versus"]["accuracy"]["rival"] != "fine-tuned"
+    table = found.tables[0].values()
     controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]
     assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", *controls]
     assert rows["pixels, logistic"] > 0.9  # brightness is in the pixels themselves

@@ -17,10 +17,9 @@ from derender import Derenderer
 from derender.baselines.autoencoders import Autoencoder, AutoencoderSettings
 from derender.baselines.supervised import fresh_resnet18
 from derender.evaluation import linear_probes
-from derender.evaluation.linear_finetune import finetune
 from derender.evaluation.linear_probes import HEADS, HeadSettings, logistic_weights, probe, train_heads
-from derender.evaluation.linear_probing import compare_linear, count_scores, linear_scores
-from derender.evaluation.linear_task import Task, choose_rows, task_of
+from derender.evaluation.linear_probing import compare_linear, finetune
+from derender.evaluation.linear_task import Task, choose_rows, count_scores, linear_scores, task_of
 from derender.evaluation.memory import Memory
 
 QUICK = HeadSettings(epochs=3, batch_size=16)

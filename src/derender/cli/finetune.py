@@ -1,6 +1,6 @@
 """`derender finetune`: encoders trained by rendering and by labels at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import typer
@@ -47,7 +47,6 @@ def finetune(
     its split is scored beside the majority and beside heads on the frozen features that training began with.
     """
     from derender import learn
-    from derender.evaluation import Scores
     from derender.evaluation.memory import memory_in
 
     published.check()
@@ -60,9 +59,7 @@ def finetune(
             images.address, out=out, **images.how, device=device, memory=memory, **how, **vars(choices)
         )
     report_run(made.run)
-    notes = [one.text(name) for name, one in made.scores.versus.items()]
     result(f"model {made.run.folder}", published.json_file)
     result(f"report {out / 'report.html'}", published.json_file)
-    values = {"run": made.run, "report": out / "report.html", "scores": made.scores.numbers()}
-    table = made.scores.table(made.start or "fresh weights")
-    published.publish(Scores([table], values, notes), memory)
+    values = {"run": made.run, "report": out / "report.html", "scores": made.scores.values}
+    published.publish(replace(made.scores, values=values), memory)

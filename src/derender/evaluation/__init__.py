@@ -23,8 +23,8 @@ from derender.evaluation.factors import (
 from derender.evaluation.feature_rows import at_least
 from derender.evaluation.identity import Pairs, area_under_roc, identify, read_pairs, verify
 from derender.evaluation.linear_probes import majority_answers, probe
-from derender.evaluation.linear_probing import compare_linear, linear, linear_scores
-from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
+from derender.evaluation.linear_probing import compare_linear, linear
+from derender.evaluation.linear_task import Rows, Task, choose_rows, linear_scores, task_of
 from derender.evaluation.paper_comparison import compare
 from derender.evaluation.photometry import brightness, relight
 from derender.evaluation.pixels import (

@@ -24,7 +24,7 @@ from derender.evaluation.bootstrap import (
     scored_row,
     with_verdicts,
 )
-from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch_hierarchy
+from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
     METRICS,
@@ -202,20 +202,17 @@ def compare_clusterings(
 
 def _numbered(values: np.ndarray, name: str) -> np.ndarray:
     """Classes as integers from 0, -1 where missing."""
-    known = ~missing(values)
-    classes = np.full(len(values), -1, np.int64)
-    if known.any():
-        classes[known] = encoded(values[known])
-    count = int(classes.max(initial=-1)) + 1
+    classes = encoded(values)
+    known, count = int((classes >= 0).sum()), int(classes.max(initial=-1)) + 1
     if count < 2:
         raise ValueError(
-            f"clustering needs at least two classes, the {int(known.sum())} labelled rows of {name!r} have "
-            f"{count}: choose another label column"
+            f"clustering needs at least two classes, the {known} labelled rows of {name!r} have {count}: "
+            "choose another label column"
         )
-    if count == known.sum():
+    if count == known:
         raise ValueError(
-            f"every one of the {int(known.sum())} labelled rows of {name!r} is a class of its own: choose a "
-            "label column whose values repeat"
+            f"every one of the {known} labelled rows of {name!r} is a class of its own: choose a label "
+            "column whose values repeat"
         )
     return classes
 
@@ -272,7 +269,7 @@ def finch_levels(features: np.ndarray, labels: np.ndarray, memory: Memory | None
     """
     labels = np.asarray(labels)
     known = ~missing(labels)
-    hierarchy = finch_hierarchy(np.asarray(features)[known], memory)
+    hierarchy = finch(np.asarray(features)[known], memory)
     counted = zip(hierarchy.counts, hierarchy.partitions, strict=True)
     own = labels[known]
     return tuple(Level(count, cluster_scores(own, one), chance_scores(own, one)) for count, one in counted)

@@ -7,9 +7,8 @@ cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``app
 FINCH: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it), with cosine distance. Every
 row is linked to its nearest other row; the connected parts are the clusters; their means are the rows of the
 next level. A level that takes away at most one cluster, or leaves only one, ends the hierarchy, as in the
-authors' package `finch-clust`. That package holds several N x N arrays (1.6 GB each for 20,000 rows). Here
-neighbours are exact in bounded memory up to 100,000 rows, and come from near cells above (neighbours.py).
-Tests compare the two. Leaves out its cut of long links, which has no effect in it.
+authors' package `finch-clust`, which holds several N x N arrays. Leaves out its cut of long links, which has
+no effect in it.
 
 Ward's criterion (1963) is reducible (Bruynooghe 1977): a merged pair is never nearer to a third cluster than
 the nearer of its parts was. So all pairs that are each other's nearest neighbour may be merged at once, and
@@ -39,10 +38,8 @@ from derender.evaluation.neighbours import (
     TILE,
     cells,
     finite_rows,
-    members,
     nearest_rows,
     of_each,
-    unit_rows,
 )
 from derender.features import named
 
@@ -98,15 +95,18 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
             nearest, distance, stale = place[nearest[kept]], distance[kept], place[stale]
 
 
-def cut(tree: np.ndarray, n_clusters: int) -> np.ndarray:
-    """Cut a Ward tree into exactly ``n_clusters``: (N,) integers from 0, numbered by first appearance."""
-    n_rows = len(tree) + 1
-    if not 1 <= n_clusters <= n_rows:
-        raise ValueError(f"cannot make {n_clusters} clusters of {n_rows} rows: ask for 1 to {n_rows}")
-    parent = np.arange(2 * n_rows - 1)
-    for step in range(n_rows - n_clusters):
-        parent[tree[step, :2].astype(np.int64)] = n_rows + step
-    root = np.arange(n_rows)
+def cut(tree: np.ndarray, n_clusters: int, leaf: np.ndarray | None = None) -> np.ndarray:
+    """Cut a Ward tree into exactly ``n_clusters``: (N,) integers from 0, numbered by first appearance.
+
+    The tree is over the rows, or over leaves; ``leaf``, (N,), is then the leaf of each row.
+    """
+    count, what = len(tree) + 1, "rows" if leaf is None else "leaves, which Ward by cells keeps"
+    if not 1 <= n_clusters <= count:
+        raise ValueError(f"cannot make {n_clusters} clusters of {count} {what}: ask for 1 to {count}")
+    parent = np.arange(2 * count - 1)
+    for step in range(count - n_clusters):
+        parent[tree[step, :2].astype(np.int64)] = count + step
+    root = np.arange(count) if leaf is None else leaf
     while not np.array_equal(parent[root], root):
         root = parent[root]
     return by_appearance(root)
@@ -118,20 +118,12 @@ def by_appearance(names: np.ndarray) -> np.ndarray:
     return np.argsort(np.argsort(first))[cluster]
 
 
-@dataclass(frozen=True)
-class LeafTree:
-    """Ward's tree over leaves: (N,) the leaf of each row, and (leaves - 1, 4) merges, as of ``ward_tree``."""
-
-    leaf: np.ndarray
-    tree: np.ndarray
-
-
 def ward_in_cells(
-    features: np.ndarray, leaves: int = LEAVES, rows_per_cell: int = CELL_ROWS, seed: int = 0
-) -> LeafTree:
-    """Approximate Ward over the rows of (N, D) features; at most as many leaves as rows."""
+    features: np.ndarray, leaves: int = LEAVES, rows_per_cell: int = CELL_ROWS
+) -> dict[str, np.ndarray]:
+    """Approximate Ward over the rows of (N, D) features: ``tree`` and ``leaf``, as ``cut`` takes them."""
     points = finite_rows(features, "Ward clustering").astype(np.float32, copy=False)
-    groups = members(cells(points, rows_per_cell, seed))
+    groups = cells(points, rows_per_cell)
     trees = list(of_each(lambda cell: _tree(points[groups[cell]]), groups))
     # the cheapest merges of all cells are made until so many clusters are left
     heights = np.concatenate([tree[:, 2] for tree in trees])
@@ -146,18 +138,7 @@ def ward_in_cells(
     for rows in np.array_split(np.argsort(leaf, kind="stable"), max(1, len(points) // 65_536)):
         held, first = np.unique(leaf[rows], return_index=True)
         sums[held] += np.add.reduceat(points[rows].astype(np.float64), first, axis=0)
-    return LeafTree(leaf, _tree(sums / sizes[:, None], sizes))
-
-
-def cut_leaves(found: LeafTree, n_clusters: int) -> np.ndarray:
-    """Cut into exactly ``n_clusters``: (N,) integers from 0, numbered by first appearance."""
-    leaves = len(found.tree) + 1
-    if not 1 <= n_clusters <= leaves:
-        raise ValueError(
-            f"Ward by cells keeps {leaves} leaves of {len(found.leaf)} rows, cannot make {n_clusters} "
-            f"clusters: ask for 1 to {leaves}"
-        )
-    return by_appearance(cut(found.tree, n_clusters)[found.leaf])
+    return {"leaf": leaf, "tree": _tree(sums / sizes[:, None], sizes)}
 
 
 def _tree(points: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
@@ -252,11 +233,11 @@ def clusterings(
             )
     inputs = {"features": features}
     if method == "finch":
-        hierarchy = finch_hierarchy(features, memory)
+        hierarchy = finch(features, memory)
         return {count: finch_clusters(features, count, hierarchy) for count in wanted}
     if method == "ward" and len(features) > neighbours.EXACT_ROWS:
-        leaves = LeafTree(**memory.recall("ward-cells", inputs, lambda: vars(ward_in_cells(features))))
-        return {count: cut_leaves(leaves, count) for count in wanted}
+        found = memory.recall("ward-cells", inputs, lambda: ward_in_cells(features))
+        return {count: cut(n_clusters=count, **found) for count in wanted}
     if method == "ward":
         tree = memory.recall_one("ward", inputs, lambda: ward_tree(features))
         return {count: cut(tree, count) for count in wanted}
@@ -267,33 +248,25 @@ def clusterings(
         means = MiniBatchKMeans(batch_size=_MINI_BATCH, **how) if many else KMeans(**how)
         return np.asarray(means.fit(features.astype(np.float32, copy=False)).labels_, np.int64)
 
-    found = {}
-    for count in wanted:
-        known = {**inputs, "seed": seed, "clusters": count}
-        found[count] = memory.recall_one("k-means", known, partial(k_means, count))
-    return found
+    keys = {count: {**inputs, "seed": seed, "clusters": count} for count in wanted}
+    return {count: memory.recall_one("k-means", key, partial(k_means, count)) for count, key in keys.items()}
 
 
-def finch_hierarchy(features: np.ndarray, memory: Memory | None = None) -> FinchHierarchy:
-    """FINCH's partitions, cached."""
+def finch(features: np.ndarray, memory: Memory | None = None) -> FinchHierarchy:
+    """FINCH's whole hierarchy over the rows of (N, D) features, cached in ``memory``."""
     features = finite_rows(features, "FINCH")
-    found = (memory or Memory()).recall_one(
-        "finch", {"features": features}, lambda: np.array(finch(features).partitions)
-    )
-    return FinchHierarchy(tuple(found))
 
+    def make() -> np.ndarray:
+        partitions = [_linked(features)]
+        while (count := int(partitions[-1].max()) + 1) > 1:
+            groups = _linked(_means(features, partitions[-1]))
+            left = int(groups.max()) + 1
+            if left == 1 or count - left <= 1:
+                break
+            partitions.append(groups[partitions[-1]])
+        return np.array(list(map(by_appearance, partitions)))
 
-def finch(features: np.ndarray) -> FinchHierarchy:
-    """FINCH's whole hierarchy over the rows of (N, D) features."""
-    features = finite_rows(features, "FINCH")
-    partitions = [_linked(features)]
-    while (count := int(partitions[-1].max()) + 1) > 1:
-        groups = _linked(_means(features, partitions[-1]))
-        left = int(groups.max()) + 1
-        if left == 1 or count - left <= 1:
-            break
-        partitions.append(groups[partitions[-1]])
-    return FinchHierarchy(tuple(map(by_appearance, partitions)))
+    return FinchHierarchy(tuple((memory or Memory()).recall_one("finch", {"features": features}, make)))
 
 
 def finch_clusters(
@@ -314,9 +287,18 @@ def finch_clusters(
             f"FINCH's finest partition of {len(features)} rows has {hierarchy.counts[0]} clusters, "
             f"cannot make {n_clusters}: ask for 1 to {hierarchy.counts[0]}, or use Ward"
         )
-    level = max(number for number, count in enumerate(hierarchy.counts) if count >= n_clusters)
-    partition, merges = hierarchy.partitions[level], hierarchy.counts[level] - n_clusters
-    return by_appearance(_merged(features, partition, merges)[partition]) if merges else partition
+    partition = [part for part in hierarchy.partitions if part.max() + 1 >= n_clusters][-1]
+    means, sizes = _means(features, partition), np.bincount(partition)
+    while len(means) > n_clusters:
+        nearest, distance = nearest_rows(means)
+        pair = distance.argmin()
+        first, second = sorted((pair, nearest[pair]))
+        means[first] += (means[second] - means[first]) * sizes[second] / (sizes[first] + sizes[second])
+        sizes[first] += sizes[second]
+        means, sizes = np.delete(means, second, axis=0), np.delete(sizes, second)
+        partition = np.where(partition == second, first, partition)
+        partition -= partition > second
+    return by_appearance(partition)
 
 
 def _linked(rows: np.ndarray) -> np.ndarray:
@@ -330,33 +312,3 @@ def _means(features: np.ndarray, partition: np.ndarray) -> np.ndarray:
     sizes = np.bincount(partition)
     member = csr_array((np.ones(len(partition)), (partition, np.arange(len(partition)))))
     return (member @ features / sizes[:, None]).astype(features.dtype, copy=False)
-
-
-def _merged(features: np.ndarray, partition: np.ndarray, merges: int) -> np.ndarray:
-    """The cluster that each becomes when the nearest pair of means is merged so many times.
-
-    Only clusters that a merge touches look for their nearest again.
-    """
-    means, sizes = _means(features, partition), np.bincount(partition).astype(np.float64)
-    alive, into = np.ones(len(means), bool), np.arange(len(means))
-    nearest, distance = nearest_rows(means)
-    for _ in range(merges):
-        pair = int(np.where(alive, distance, np.inf).argmin())
-        first, second = sorted((pair, int(nearest[pair])))
-        means[first] += (means[second] - means[first]) * sizes[second] / (sizes[first] + sizes[second])
-        sizes[first] += sizes[second]
-        alive[second], into[into == second] = False, first
-        others = np.flatnonzero(alive)
-        if len(others) < 2:
-            break
-        touched = alive & ((nearest == first) | (nearest == second))
-        touched[first] = True
-        rows = np.flatnonzero(touched)
-        gaps = 1 - unit_rows(means[rows]) @ unit_rows(means[others]).T
-        gaps[rows[:, None] == others] = np.inf
-        at = gaps.argmin(axis=1)
-        nearest[rows], distance[rows] = others[at], gaps[np.arange(len(rows)), at]
-        gap = 1 - unit_rows(means[others]) @ unit_rows(means[[first]])[0]
-        closer = (gap < distance[others]) & (others != first)
-        nearest[others[closer]], distance[others[closer]] = first, gap[closer]
-    return into

@@ -98,6 +98,8 @@ def scores_of_counts(counts: np.ndarray) -> np.ndarray:
 def cluster_scores(labels: np.ndarray, assignment: np.ndarray) -> dict[str, float]:
     """Score any (N,) clustering of rows against their (N,) classes; names do not matter."""
     classes, assignment = encoded(labels), np.asarray(assignment)
+    if (classes < 0).any():
+        raise ValueError(f"{(classes < 0).sum()} labels are missing: drop these rows first")
     if assignment.shape != classes.shape:
         raise ValueError(f"labels {classes.shape} and assignment {assignment.shape} must be of one length")
     if len(classes) == 0:
@@ -124,13 +126,15 @@ def chance_scores(
 
 
 def encoded(labels: np.ndarray) -> np.ndarray:
-    """Classes as integers from 0."""
+    """Classes as integers from 0, -1 where missing."""
     labels = np.asarray(labels)
     if labels.ndim != 1:
         raise ValueError(f"labels must be one value per row, got shape {labels.shape}")
-    if missing(labels).any():
-        raise ValueError(f"{int(missing(labels).sum())} labels are missing: drop these rows first")
-    if labels.dtype.kind == "O":
-        numbers = {value: number for number, value in enumerate(dict.fromkeys(labels.tolist()))}
-        return np.array([numbers[value] for value in labels.tolist()], dtype=np.int64)
-    return np.unique(labels, return_inverse=True)[1]
+    known = ~missing(labels)
+    values, classes = labels[known], np.full(len(labels), -1, np.int64)
+    if values.dtype.kind == "O":
+        numbers = {value: number for number, value in enumerate(dict.fromkeys(values.tolist()))}
+        classes[known] = [numbers[value] for value in values.tolist()]
+    else:
+        classes[known] = np.unique(values, return_inverse=True)[1]
+    return classes

@@ -12,7 +12,6 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +33,6 @@ from derender.data import ImageSet
 from derender.evaluation.feature_rows import (
     FeatureRow,
     FeatureSource,
-    cached_table,
     check_rows,
     embedded_table,
     is_model,
@@ -42,11 +40,12 @@ from derender.evaluation.feature_rows import (
 )
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
+from derender.evaluation.pixels import component_count
 from derender.features import FeatureTable, model_fingerprint
 from derender.inputs import Progress, as_images, as_model, device_named
 from derender.model import Derenderer
 from derender.postprocess import Features
-from derender.postprocess.whitening import Projection, Whitening
+from derender.postprocess.whitening import Whitening
 from derender.presets import ModelSettings
 from derender.training.config import FeatureSettings, TrainConfig
 from derender.training.features import Describe, fit_whitening
@@ -54,7 +53,6 @@ from derender.training.features import Describe, fit_whitening
 UNTRAINED = "untrained encoder"
 MISSING_CONTROLS = "without images there are no pixels, PCA and untrained encoder to compare with"
 DEFAULT_SIZE = 64  # of the controls beside features of an unknown architecture
-COMPONENTS, LENT_COMPONENTS = 64, 256
 _SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
 
@@ -100,15 +98,15 @@ def control_rows(
         }
         rows.append(_untrained_row(UNTRAINED, twins, images, options))
     fitted = images if fit_on is None else fit_on
-    components = max(1, min(COMPONENTS, len(fitted) // 4))  # whitening needs many more rows than components
+    components = component_count(len(fitted))  # whitening needs many more rows than components
     inputs = {"images": images.images, "components": components}
     if fit_on is not None:
         inputs["fit_on"] = fit_on.images
-    pca = cached_table(
-        options.memory, "pca", inputs, images,
-        lambda: dict(pca_features(images, components=components, fit_on=fitted).factors),
-    )  # fmt: skip
-    rows.append(FeatureRow(f"PCA ({components})", (pca,), control=True))
+    pca = options.memory.recall_one(
+        "pca", inputs, lambda: pca_features(images, components=components, fit_on=fitted).factors["pca"]
+    )
+    table = control_table(images, "pca", pca, {"components": components})
+    rows.append(FeatureRow(f"PCA ({components})", (table,), control=True))
     options.notes.append(
         f"PCA ({components}), whitened, is fitted to {len(fitted):,} images of {fitted.source}"
     )
@@ -200,7 +198,7 @@ class Renderings:
     @property
     def n_components(self) -> int:
         """256 principal components, and at most a quarter of the number of images."""
-        return max(1, min(LENT_COMPONENTS, len(self.images) // 4))
+        return component_count(len(self.images), most=256)
 
     def whiten(self, encoder: Derenderer, progress: Progress | None = None) -> Derenderer:
         """A copy of an encoder whose geometry and albedo are whitened by the renderings; its scenes stay."""
@@ -221,20 +219,14 @@ class Renderings:
         """Principal components of the lent images, whitened by their renderings: factor ``pca``."""
         count = self.n_components
         pca = PCA(count, random_state=0).fit(flat_pixels(self.images))
-        mean = torch.from_numpy(pca.mean_).float()
-        components: Any = pca.components_
-        axes = torch.from_numpy(components.T.copy()).float()
-
-        def projected(flat: Float[Tensor, "n pixel"]) -> Float[Tensor, "n component"]:
-            return (flat - mean) @ axes
 
         def described(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-            return {"pca": projected(batch.detach().cpu().float().flatten(1))}
+            return {"pca": torch.from_numpy(pca.transform(batch.numpy(force=True).reshape(len(batch), -1)))}
 
         whitening = self._fitted(described, f"pca {count} None", progress)
         views = [images.images, images.images[..., ::-1]] if whitening.mirrored else [images.images]
-        codes = torch.cat([projected(torch.from_numpy(flat_pixels(one))) for one in views], dim=1)
-        origin = {"control": "pca", "components": count, "whitened": True, "fitted_on": len(self.images)}
+        codes = torch.cat([torch.from_numpy(pca.transform(flat_pixels(one))) for one in views], dim=1)
+        origin = {"components": count, "whitened": True, "fitted_on": len(self.images)}
         return control_table(images, "pca", whitening({"pca": codes})["pca"].numpy(), origin)
 
     def _fitted(
@@ -255,12 +247,7 @@ class Renderings:
             return {name: value.cpu().numpy() for name, value in found.named_buffers()}
 
         arrays = self.memory.recall("lent whitening", inputs, make)
-        names = [name.removesuffix("_map") for name in arrays if name.endswith("_map")]
-        contrasts = {}
-        for name in names:
-            parts = (arrays[f"{name}_{part}"] for part in ("mean", "map", "ratios"))
-            contrasts[name] = Projection(*map(torch.from_numpy, parts))
-        return Whitening(contrasts, mirrored=names if settings.whitening.mirrored else ())
+        return Whitening.of({name: torch.from_numpy(values) for name, values in arrays.items()})
 
 
 def _whitening_settings(model: Derenderer) -> FeatureSettings:

@@ -177,23 +177,21 @@ def evaluate_factors(
         raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
     constant = (true.sum(dim=0) / true_mask.sum(dim=0).clamp_min(1)).expand_as(true)
     direction = light_in_camera(true_light, true_camera)
-    own, every = (albedo_error(albedo, true, both, one_scale=one) for one in (False, True))
-    fixed, fixed_every = (albedo_error(constant, true, true_mask, one_scale=one) for one in (False, True))
+    albedos = {
+        "albedo": albedo_error(albedo, true, both),
+        "albedo_global": albedo_error(albedo, true, both, one_scale=True),
+        "albedo_control": albedo_error(constant, true, true_mask),
+        "albedo_global_control": albedo_error(constant, true, true_mask, one_scale=True),
+    }
     return FactorResult(
-        own.nanmean().item(),
-        fixed.mean().item(),
-        every.nanmean().item(),
-        fixed_every.mean().item(),
-        light_error(light, camera, true_light, true_camera),
-        _angles(angle_deg(direction.mean(dim=0).expand_as(direction), direction)),
-        light_error(light, camera, true_light, true_camera, aligned=True),
-        camera_error(camera, true_camera),
-        camera_error(torch.zeros_like(true_camera), true_camera),
-        own.numpy(),
-        every.numpy(),
-        fixed.numpy(),
-        fixed_every.numpy(),
-        None if untrained is None else evaluate_factors(untrained, truth, batch_size=batch_size),
+        **{name: each.nanmean().item() for name, each in albedos.items()},
+        **{f"{name}_each": each.numpy() for name, each in albedos.items()},
+        light=light_error(light, camera, true_light, true_camera),
+        light_control=_angles(angle_deg(direction.mean(dim=0).expand_as(direction), direction)),
+        light_aligned=light_error(light, camera, true_light, true_camera, aligned=True),
+        camera=camera_error(camera, true_camera),
+        camera_control=camera_error(torch.zeros_like(true_camera), true_camera),
+        untrained=None if untrained is None else evaluate_factors(untrained, truth, batch_size=batch_size),
     )
 
 

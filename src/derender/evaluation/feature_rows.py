@@ -5,7 +5,8 @@ one of tables and models, ``prepare`` the arrays that protocols take. Leaves out
 scores.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -14,7 +15,7 @@ import numpy as np
 
 from derender.baselines import load_baseline
 from derender.data import ImageSet
-from derender.evaluation.memory import Arrays, Memory
+from derender.evaluation.memory import Memory
 from derender.evaluation.options import DEFAULT_FACTORS, Options
 from derender.features import FeatureTable, embed_images, missing, model_fingerprint, table_labels
 from derender.inputs import Progress, as_model, device_named
@@ -93,10 +94,9 @@ def one_row(features: FeatureSource, options: Options) -> FeatureRow:
     row = row_of("all" if chosen is None else " + ".join(chosen), features, options)
     if chosen is None or row.factors is not None:
         return row
-    table = row.tables[0]
     if chosen != DEFAULT_FACTORS:
-        table.concatenate(chosen)  # raises: names the unknown factor
-    return replace(row, name=" + ".join(table.factors))
+        row.tables[0].concatenate(chosen)  # raises: names the unknown factor
+    return replace(row, name=" + ".join(row.tables[0].factors))
 
 
 def opened(source: ModelSource, device: str) -> Any:
@@ -123,23 +123,15 @@ def runs_of(runs: FeatureSource | Sequence[FeatureSource]) -> list[FeatureSource
 def embedded_table(
     model: Any, images: ImageSet, memory: Memory, progress: Progress | None = None
 ) -> FeatureTable:
-    """A model's features of images, cached by the content of both."""
-    weights = model_fingerprint(model)
-    table = cached_table(
-        memory, "embedding", {"weights": weights, "images": images.images}, images,
-        lambda: embed_images(model, images.images, progress=progress),
-    )  # fmt: skip
-    origin = {"model": type(model).__name__, "settings": model.settings.model_dump(mode="json")}
-    origin["weights"] = weights
-    return replace(table, origin={**table.origin, **origin})
-
-
-def cached_table(
-    memory: Memory, what: str, inputs: Mapping[str, Any], images: ImageSet, make: Callable[[], Arrays]
-) -> FeatureTable:
-    """A feature table whose arrays are cached; names and labels come from the images."""
-    factors = memory.recall(what, inputs, make)
-    origin = {"data": images.source, "layout": images.layout}
+    """A model's features of images, cached by the content of both; names and labels are the images'."""
+    inputs = {"weights": model_fingerprint(model), "images": images.images}
+    factors = memory.recall(
+        "embedding", inputs, lambda: embed_images(model, images.images, progress=progress)
+    )
+    origin = {
+        "data": images.source, "layout": images.layout, "model": type(model).__name__,
+        "settings": model.settings.model_dump(mode="json"), "weights": inputs["weights"],
+    }  # fmt: skip
     return FeatureTable(images.files, factors, table_labels(images), origin)
 
 
@@ -191,33 +183,30 @@ def prepare(
     """
     check_rows(rows)
     first = rows[0].tables[0]
-    capped = min_count > 1 or max_count is not None
-    if capped and len(labels) != 1:
-        raise ValueError(f"min_count and max_count go with one label, not with {len(labels)}")
     absent = np.any([missing(first.label(name)) for name in (*labels, *mean_by)], axis=0)
 
-    dropped = [int(absent.sum()) if mean_by else 0]
-
-    def arranged(table: FeatureTable) -> FeatureTable:
+    def averaged(table: FeatureTable) -> FeatureTable:
         table = replace(table, labels=first.labels)
-        if mean_by:
-            table = table.select(~absent).mean_by(*mean_by)
-            if differing := [name for name in labels if name not in table.labels]:
-                raise ValueError(
-                    f"label {differing[0]!r} differs inside groups of {', '.join(mean_by)}: average by it too"
-                )
-        if capped:
-            values = table.label(labels[0])
-            kept = np.union1d(at_least(values, min_count, max_count), np.flatnonzero(missing(values)))
-            dropped.append(dropped[0] + len(table) - len(kept))
-            table = table.select(kept)
-        return table
+        return table.select(~absent).mean_by(*mean_by) if mean_by else table
 
-    made = [replace(row, tables=tuple(map(arranged, row.tables))) for row in rows]
-    table = made[0].tables[0]
-    features, known = {row.name: row.arrays() for row in made}, {name: table.label(name) for name in labels}
-    controls = tuple(row.name for row in rows if row.control)
-    return Prepared(features, known, table, controls, dropped[-1])
+    table = averaged(first)
+    if differing := [name for name in labels if name not in table.labels]:
+        raise ValueError(
+            f"label {differing[0]!r} differs inside groups of {', '.join(mean_by)}: average by it too"
+        )
+    kept = np.arange(len(table))
+    if min_count > 1 or max_count is not None:
+        if len(labels) != 1:
+            raise ValueError(f"min_count and max_count go with one label, not with {len(labels)}")
+        values = table.label(labels[0])
+        kept = np.union1d(at_least(values, min_count, max_count), np.flatnonzero(missing(values)))
+    n_dropped = len(table) - len(kept) + (int(absent.sum()) if mean_by else 0)
+    table = table.select(kept)
+    arrays = {
+        row.name: [averaged(one).select(kept).concatenate(row.factors) for one in row.tables] for row in rows
+    }
+    known = {name: table.label(name) for name in labels}
+    return Prepared(arrays, known, table, tuple(row.name for row in rows if row.control), n_dropped)
 
 
 def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndarray:
@@ -226,11 +215,9 @@ def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndar
     LFW's protocol here is ``at_least(identity, 20, most=20)``. One of its 31 people with 20 images has 530:
     all of these would decide the purity (0.35 for any clustering at all).
     """
-    labels = np.asarray(labels)
-    present = np.flatnonzero(~missing(labels))
-    places: dict[Any, list[int]] = {}
-    for row, value in zip(present.tolist(), labels[present].tolist(), strict=True):
-        places.setdefault(value, []).append(row)
+    labels, places = np.asarray(labels), defaultdict(list)
+    for row in np.flatnonzero(~missing(labels)).tolist():
+        places[labels[row]].append(row)
     rows = [row for own in places.values() if len(own) >= count for row in own[:most]]
     if not rows:
         largest = max(map(len, places.values()), default=0)

@@ -25,15 +25,16 @@ from torch import Generator, Tensor, nn
 
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, Split, split_indices
-from derender.evaluation.bootstrap import RESAMPLES, Difference, ScoredRow, difference, numbers_of
-from derender.evaluation.controls import control_rows
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, numbers_of, with_verdicts
+from derender.evaluation.controls import UNTRAINED, control_rows
+from derender.evaluation.feature_rows import embedded_table
 from derender.evaluation.linear_probes import head_loss, probabilities
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import ScoreTable, scored_table
-from derender.features import embed_images, map_batches, model_fingerprint, named
+from derender.evaluation.score_table import Scores, scored_table
+from derender.features import map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
 from derender.objectives.perceptual_features import PerceptualFeatures
@@ -268,52 +269,20 @@ class FinetuneStep(nn.Module):
         return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))
 
 
-@dataclass(frozen=True)
-class FinetuneScores:
-    """Held-out scores of ``fine-tuned``, both heads on frozen features, logistic regression on three
-    controls, and ``majority``: accuracy, balanced_accuracy, average_precision (0..1, best 1).
-
-    ``versus`` compares the fine-tuned model with the best of the others, by score. ``n_unlabelled`` images of
-    the run have none of the labels: rendered, never asked.
-    """
-
-    rows: tuple[ScoredRow, ...]
-    versus: dict[str, Difference]
-    kind: str
-    names: tuple[str, ...]
-    n_train: int
-    n_test: int
-    n_unlabelled: int
-
-    def numbers(self) -> dict[str, Any]:
-        """Everything as JSON takes it."""
-        versus = {name: asdict(one) for name, one in self.versus.items()}
-        return {**vars(self), "rows": numbers_of(self.rows), "versus": versus}
-
-    def table(self, began: str) -> ScoreTable:
-        """A row each; ``began`` names the model whose frozen features the heads take."""
-        count = len(self.names)
-        task = f"{count} classes" if self.kind == "classes" else f"mean of {count} yes/no labels"
-        caption = (
-            f"{task}: {self.n_train:,} labelled images learned, {self.n_test:,} held out; frozen features "
-            f"of {began}"
-        )
-        if self.n_unlabelled:
-            caption += f"; {self.n_unlabelled:,} images without label never asked"
-        return scored_table(
-            caption, "trained on labels", self.rows, LINEAR_COLUMNS, intervals=BOTH, deviations=()
-        )
-
-
 def score_finetuned(
     tuned: FinetunedModel,
     task: FinetuneTask,
     *,
+    began: str = "fresh weights",
     resample_count: int = RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
-) -> FinetuneScores:
-    """Score a trained model on the task's test part; what took long is kept in ``memory``.
+) -> Scores:
+    """Held-out scores of ``fine-tuned``, of heads on frozen features and of controls, 0..1, best 1.
+
+    Beside it stand both heads on the frozen features of ``began``, logistic regression on three controls, and
+    ``majority``; ``versus`` compares it with the best of these. ``n_unlabelled`` images have none of the
+    labels. ``result`` are the ``ScoredRow``; what took long is kept in ``memory``.
 
     Raises:
         ValueError: no tested image has a label.
@@ -327,17 +296,17 @@ def score_finetuned(
             "bring more images, or set a larger test share in split="
         )
 
-    def answered() -> dict[str, np.ndarray]:
+    def answered() -> np.ndarray:
         parts = map_batches(tuned.predict, tuned, task.images[test], batch_size=256)
-        return {"answers": torch.cat(parts).cpu().numpy()}
+        return torch.cat(parts).cpu().numpy()
 
     inputs = {"weights": model_fingerprint(tuned), "kind": target.asked.kind, "images": task.images[test]}
-    answers = kept.recall("finetuned-answers", inputs, answered)["answers"]
-    start = (task.start if task.start is not None else task.build().model).to(tuned.device)
-    features = _features(start, task, np.concatenate([train, test]), kept)
-    count, runs = len(train), {name: [values] for name, values in features.items()}
-    rows = Rows(np.arange(count, count + len(test)), {count: np.arange(count)[None]})
-    asked = Task(target.asked.kind, target.asked.names, target.asked.targets[np.concatenate([train, test])])
+    answers = kept.recall_one("finetuned-answers", inputs, answered)
+    learned_and_tested, count = np.concatenate([train, test]), len(train)
+    start = (task.start or task.build().model).to(tuned.device)
+    runs = _features(start, task, learned_and_tested, kept)
+    asked = target.asked.select(learned_and_tested)
+    rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
     how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}
     tuned_answers = {"fine-tuned": {count: answers[None]}}
     logistic, joint = compare_linear(
@@ -346,28 +315,36 @@ def score_finetuned(
     frozen_alone = {"frozen": runs["frozen"]}
     (paper,) = compare_linear(frozen_alone, asked, rows, (seed,), heads=("linear",), **how).parts
     ours, majority = joint.rows
-    frozen, *controls = logistic.rows[: len(features)]
+    frozen, *controls = logistic.rows[:-1]
     beside = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
     beside |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
-    others = {name: row.scores for name, row in beside.items()}
-    rivals = {score: {name: scores[score] for name, scores in others.items()} for score in BOTH}
-    controls = (ScoredRow(name, True, 1, scores) for name, scores in others.items())
-    scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *controls)
-    versus = {score: difference(ours.scores[score], rivals[score]) for score in BOTH}
-    unlabelled = int((~target.asked.known).sum())
-    return FinetuneScores(scored, versus, asked.kind, asked.names, count, len(test), unlabelled)
+    others = [ScoredRow(name, True, 1, row.scores) for name, row in beside.items()]
+    scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *others)
+    versus = with_verdicts(scored)[0].versus
+    notes = [versus[score].text(score) for score in BOTH]
+    unlabelled, names = int((~target.asked.known).sum()), asked.names
+    task_name = f"{len(names)} classes" if asked.kind == "classes" else f"mean of {len(names)} yes/no labels"
+    caption = (
+        f"{task_name}: {count:,} labelled images learned, {len(test):,} held out; frozen features of {began}"
+    )
+    if unlabelled:
+        caption += f"; {unlabelled:,} images without label never asked"
+    every: dict[str, Any] = {"intervals": BOTH, "deviations": ()}
+    table = scored_table(caption, "trained on labels", scored, LINEAR_COLUMNS, **every)
+    values = {
+        "rows": numbers_of(scored), "versus": {score: asdict(versus[score]) for score in BOTH},
+        "kind": asked.kind, "names": names, "n_train": count, "n_test": len(test), "n_unlabelled": unlabelled,
+    }  # fmt: skip
+    return Scores([table], values, notes, result=scored)
 
 
-def _features(start: Any, task: FinetuneTask, rows: np.ndarray, kept: Memory) -> dict[str, np.ndarray]:
-    """(R, D) of some of the task's images: codes that training began with, and three that learned nothing."""
-
-    def codes(model: Any) -> np.ndarray:
-        inputs = {"weights": model_fingerprint(model), "images": task.images[rows]}
-        found = kept.recall("embedding", inputs, lambda: embed_images(model, task.images[rows]))
-        return np.concatenate([found[name] for name in task.config.target.factors], axis=1)
-
-    parts = (rows, task.target.split.train)
+def _features(
+    start: Derenderer, task: FinetuneTask, rows: np.ndarray, kept: Memory
+) -> dict[str, list[np.ndarray]]:
+    """Of some of the task's images (R, D) codes that training began with, and three that learned nothing."""
+    parts, factors = (rows, task.target.split.train), task.config.target.factors
     shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
+    models = {"frozen": start, UNTRAINED: untrained_twin(start, task.config.seed)}
+    codes = {name: [embedded_table(one, shown, kept).concatenate(factors)] for name, one in models.items()}
     plain = control_rows(shown, None, Options(cache=kept), fit_on=fitted)
-    untrained = {"untrained encoder": codes(untrained_twin(start, task.config.seed))}
-    return {"frozen": codes(start)} | untrained | {row.name: row.arrays()[0] for row in plain}
+    return codes | {row.name: row.arrays() for row in plain}

@@ -14,10 +14,10 @@ with the majority; ``centred`` treats all alike.
 
 The objective of the penalised regression is scikit-learn's: C times the sum of the losses plus half the
 squared weights, intercept free; tests hold both to the same answer. Forty labels, six penalties and five
-folds are 1,200 regressions on one set of rows, so all are solved together. The rows are rotated onto their
-principal axes: 12,288 pixels of 1,000 rows become 1,000 numbers, and nothing changes under this penalty.
-There the curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps scaled by it need
-only two matrix products each. A solved regression drops out.
+folds are 1,200 regressions on one set of rows, so all of one penalty are solved together. The rows are
+rotated onto their principal axes: 12,288 pixels of 1,000 rows become 1,000 numbers, and nothing changes under
+this penalty. There the curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps
+scaled by it need only two matrix products each.
 """
 
 from collections.abc import Sequence
@@ -89,7 +89,7 @@ def probe(
         "seeds": list(seeds), "settings": settings.model_dump() if papers else {},
     }  # fmt: skip
 
-    def answers(own: np.ndarray, seed: int) -> np.ndarray:
+    def learned(own: np.ndarray, seed: int) -> np.ndarray:
         if head == "k-NN":
             return nearest_answers(features[own], targets[own], features[tested])
         weight, bias, _ = logistic_weights(features[own], targets[own], kind=kind, seed=seed)
@@ -100,8 +100,8 @@ def probe(
     def make() -> np.ndarray:
         if papers:
             how = {"kind": kind, "seeds": seeds, "settings": settings, "centred": head == "centred"}
-            return train_heads(features, targets, rows, tested, **how).astype(np.float32)
-        return np.stack([answers(*one) for one in zip(rows, seeds, strict=True)]).astype(np.float32)
+            return train_heads(features, targets, rows, tested, **how)
+        return np.stack(list(map(learned, rows, seeds))).astype(np.float32)
 
     return (memory or Memory()).recall_one(f"probe-{head}", inputs, make)
 
@@ -117,13 +117,12 @@ def probe_runs(
     memory: Memory | None,
 ) -> np.ndarray:
     """(S, T, A) answers; seed s uses run s modulo their number, and seeds that share a run learn together."""
-    answers = {}
+    answers = np.empty((len(seeds), len(tested), task.targets.shape[1]), np.float32)
     for run, array in enumerate(arrays[: len(seeds)]):
-        mine = list(range(run, len(seeds), len(arrays)))
-        own = [seeds[at] for at in mine]
-        found = probe(head, array, task, rows[mine], tested, own, settings=settings, memory=memory)
-        answers |= dict(zip(mine, found, strict=True))
-    return np.stack([answers[at] for at in range(len(seeds))])
+        mine = slice(run, None, len(arrays))
+        own = {"settings": settings, "memory": memory}
+        answers[mine] = probe(head, array, task, rows[mine], tested, seeds[mine], **own)
+    return answers
 
 
 def nearest_answers(
@@ -258,33 +257,26 @@ def logistic_weights(
         )
     (rows, mean, back), labels = rotated(features), np.asarray(targets, np.float64)
     fold = np.random.default_rng(seed).permutation(len(rows)) % folds
-    learned = np.repeat([fold != number for number in range(folds)], len(penalties), axis=0).T
-    single, c = rows.astype(np.float32), np.tile(np.asarray(penalties, np.float64), folds)
-    weights = solve_logistic(single, labels, learned, c, kind, tolerance=1e-3)
-    logits = np.tensordot(single, weights[:-1], axes=1) + weights[-1]  # (n, problems, A)
-    loss = np.where(learned[:, :, None], 0.0, _losses(logits, labels, kind))
-    loss = loss.reshape(len(rows), folds, len(penalties), -1)
-    chosen = np.asarray(penalties)[loss.sum(axis=(0, 1)).argmin(axis=0)]
-    distinct, own = np.unique(chosen, return_inverse=True)
-    found = solve_logistic(rows, labels, np.ones((len(rows), len(distinct)), bool), distinct, kind)
-    picked = found[:, own, np.arange(labels.shape[1])] if kind == "labels" else found[:, own[0]]
-    weight = back @ picked[:-1]
-    return weight, picked[-1] - mean @ weight, chosen
+    learned, single, losses = fold[:, None] != np.arange(folds), rows.astype(np.float32), []
+    for c in penalties:
+        weights = solve_logistic(single, labels, learned, c, kind, tolerance=1e-3)
+        logits = np.tensordot(single, weights[:-1], axes=1) + weights[-1]  # (n, folds, A)
+        losses.append(np.where(learned[:, :, None], 0.0, _losses(logits, labels, kind)).sum(axis=(0, 1)))
+    chosen = np.asarray(penalties)[np.argmin(losses, axis=0)]
+    whole = np.ones((len(rows), 1), bool)
+    found = {c: solve_logistic(rows, labels, whole, c, kind)[:, 0] for c in set(chosen.tolist())}
+    own = chosen.tolist() if kind == "labels" else chosen.tolist() * labels.shape[1]
+    picked = np.stack([found[c][:, label] for label, c in enumerate(own)], axis=1)
+    return back @ picked[:-1], picked[-1] - mean @ (back @ picked[:-1]), chosen
 
 
 def solve_logistic(
-    rows: np.ndarray,
-    targets: np.ndarray,
-    learned: np.ndarray,
-    c: np.ndarray,
-    kind: str,
-    *,
-    tolerance: float = 1e-5,
+    rows: np.ndarray, targets: np.ndarray, learned: np.ndarray, c: float, kind: str, tolerance: float = 1e-5
 ) -> np.ndarray:
     """Solve P regressions on parts of the same rows: (R + 1, P, A) weights, the intercept last.
 
     ``rows`` are (n, R), centred, with columns orthogonal to each other (from ``rotated``). ``learned``, (n,
-    P) bool, are those that each regression learns from, ``c`` (P,) penalties. It stops when the scaled
+    P) bool, are those that each regression learns from, ``c`` is their penalty. It stops when every scaled
     gradient is below ``tolerance`` of its start, or after ``MOST_STEPS``.
     """
     dtype = rows.dtype
@@ -293,12 +285,10 @@ def solve_logistic(
     counted = (learned[:, :, None] & (targets >= 0)[:, None]).astype(dtype)
     ridge = np.append(np.ones(rows.shape[1]), 0.0)[:, None, None].astype(dtype)
     curve = 0.25 if kind == "labels" else 0.5
-    bound = curve * (design.astype(np.float64) ** 2).sum(axis=0)[:, None, None] * c[None, :, None] + ridge
-    bound, strength = bound.astype(dtype), c[None, :, None].astype(dtype)
-
-    found = np.zeros((design.shape[1], len(c), targets.shape[1]), dtype)
-    weights = ahead = found.copy()
-    momentum, start, left = np.ones((1, len(c), 1), dtype), None, np.arange(len(c))
+    bound = curve * (design.astype(np.float64) ** 2).sum(axis=0)[:, None, None] * c + ridge
+    bound, strength = bound.astype(dtype), dtype.type(c)
+    weights = ahead = np.zeros((design.shape[1], learned.shape[1], targets.shape[1]), dtype)
+    momentum, start = np.ones((1, learned.shape[1], 1), dtype), None
     for step in range(MOST_STEPS):
         logits = np.tensordot(design, ahead, axes=1)
         answer = expit(logits) if kind == "labels" else softmax(logits, axis=2)
@@ -312,17 +302,9 @@ def solve_logistic(
         if step % 10 == 0:
             size = np.sqrt((slope.astype(np.float64) ** 2 / bound).sum(axis=0))
             start = np.maximum(size, 1e-12) if start is None else start
-            rest = ~(size <= tolerance * start).all(axis=1)
-            if not rest.all():
-                found[:, left[~rest]] = moved[:, ~rest]
-                left, start = left[rest], start[rest]
-                momentum, weights, ahead, counted, bound, strength = (
-                    one[:, rest] for one in (momentum, weights, ahead, counted, bound, strength)
-                )
-            if not len(left):
-                return found
-    found[:, left] = weights
-    return found
+            if (size <= tolerance * start).all():
+                break
+    return weights
 
 
 def _losses(logits: np.ndarray, targets: np.ndarray, kind: str) -> np.ndarray:

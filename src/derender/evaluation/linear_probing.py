@@ -8,15 +8,26 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4.4. All features are asked the same
 Scores are averaged over labels (or classes). Accuracy rewards the majority's answer (0.80 on CelebA):
 balanced accuracy is 0.5 for any constant answer (one over the number of classes). Average precision needs no
 threshold, and is the label's share for answers that know nothing.
+
+Table 2's "Finetune" trains the encoders, too. They and the head share Adam 2e-4, 100 epochs and batches of
+64; the paper does not say whether the encoders had a rate of their own. Of a baseline the whole network is
+trained; a ResNet-18 with fresh weights is the paper's supervised row. An untrained model under the same
+protocol is the control. Controls without an encoder have nothing below the head to train: theirs are the
+answers of the head alone. Leaves out the rendering objective beside the task (finetuning.py).
 """
 
+import copy
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-from sklearn.metrics import average_precision_score
+import torch
+from torch import nn
 
+from derender.baselines.controls import untrained_twin
+from derender.data import as_float
 from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
@@ -26,7 +37,7 @@ from derender.evaluation.bootstrap import (
     scored_row,
     with_verdicts,
 )
-from derender.evaluation.controls import subject_and_controls
+from derender.evaluation.controls import UNTRAINED, subject_and_controls
 from derender.evaluation.feature_rows import (
     FeatureSource,
     ModelSource,
@@ -34,30 +45,33 @@ from derender.evaluation.feature_rows import (
     check_lengths,
     chosen_labels,
     is_model,
+    opened,
     prepare,
 )
-from derender.evaluation.linear_finetune import finetuned_answers
 from derender.evaluation.linear_probes import (
     HEADS,
     PAPER_HEAD,
     PROBES,
     HeadSettings,
+    head_loss,
     majority_answers,
+    probabilities,
     probe_runs,
 )
-from derender.evaluation.linear_task import Rows, Task, choose_rows, task_of
+from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, linear_scores, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table, verdict_table
-from derender.features import named
-from derender.inputs import Progress
+from derender.features import model_fingerprint, named
+from derender.inputs import Progress, device_named
+from derender.model import Derenderer
 
 LINEAR_COLUMNS = {
     "accuracy": Column("accuracy", "high", note="share of right answers at threshold 0.5, 0 to 1"),
     "balanced_accuracy": Column("balanced", "high", note="mean recall over values or classes, 0 to 1"),
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
-FINETUNED, ABOVE = "fine-tuned", "above the strongest control?"
+FINETUNED, SUPERVISED = "fine-tuned", "ResNet-18, supervised"
 PROBE_NAMES = {**PROBES, FINETUNED: "the paper's head, encoders trained too"}
 
 
@@ -171,8 +185,9 @@ def compare_prepared(
     """
     task = task_of(ready.labels)
     split = choose_rows(task, counts=counts, seeds=seeds, **ready.split, **rows)
-    how = (ready, task, split, seeds, settings, options, supervised)
-    tuned = finetuned_answers(models, *how) if models else None
+    tuned = None
+    if models:
+        tuned = finetuned_answers(models, ready, task, split, seeds, settings, options, supervised)
     return compare_linear(
         ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
         settings=settings, resample_count=options.resamples, memory=options.memory,
@@ -207,7 +222,7 @@ def compare_linear(
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
     for head in (*heads, *([FINETUNED] if finetuned else [])):
         for count, own in rows.train.items():
-            answers: dict[str, np.ndarray] = {}
+            answers = {}
             if head == FINETUNED:
                 answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
             for name, arrays in features.items() if head != FINETUNED else ():
@@ -246,58 +261,121 @@ def linear_tables(found: LinearComparison) -> list[ScoreTable]:
         asked += f"; {found.n_dropped:,} rows without label left out"
     for part in found.parts:
         rows = f"{part.count:,} labelled rows"
-        caption, judged = f"{rows}, {PROBE_NAMES[part.head]}: {asked}", f"{rows}, {part.head}: {ABOVE}"
+        caption = f"{rows}, {PROBE_NAMES[part.head]}: {asked}"
+        judged = f"{rows}, {part.head}: above the strongest control?"
         tables.append(scored_table(caption, "features", part.rows, LINEAR_COLUMNS))
         tables.append(verdict_table(part.rows, LINEAR_COLUMNS, judged))
     return tables
 
 
-@dataclass(frozen=True)
-class LinearScores:
-    """How right answers are, 0..1, best 1.
-
-    Share of right answers (at threshold 0.5, or of the likeliest class) and its mean over the rows of each
-    value or class. Then area under precision over recall of each.
-    """
-
-    accuracy: float
-    balanced_accuracy: float
-    average_precision: float
-
-
-def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> LinearScores:
-    """Score (T, A) probabilities against (T, A) targets in -1 (unknown), 0, 1; one-hot for classes.
-
-    Values and classes that no row has do not count.
-    """
-    accuracy, balanced = count_scores(targets, probabilities, kind, np.ones((1, len(targets)), np.float32))[0]
-    columns = [(t, t >= 0, p) for t, p in zip(targets.T, probabilities.T, strict=True) if (t == 1).any()]
-    precisions = [average_precision_score(truth[known], answer[known]) for truth, known, answer in columns]
-    precision = float(np.mean(precisions)) if precisions else float("nan")
-    return LinearScores(float(accuracy), float(balanced), precision)
-
-
-def count_scores(
-    targets: np.ndarray, probabilities: np.ndarray, kind: str, weights: np.ndarray
+def finetune(
+    model: Any,
+    images: np.ndarray,
+    task: Task,
+    rows: np.ndarray,
+    tested: np.ndarray,
+    *,
+    factors: Sequence[str] = ("geometry", "albedo"),
+    seed: int = 0,
+    settings: HeadSettings = PAPER_HEAD,
+    progress: Progress | None = None,
 ) -> np.ndarray:
-    """Accuracy and balanced accuracy, (B, 2), of ``linear_scores`` on resamples: (B, T) times each is
-    drawn.
+    """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
+
+    The model, ours or a baseline, stays as it was. ``images`` are (N, 3, H, W) uint8, ``rows`` (n,) training
+    rows. The seed is of the head's start and the order of images. ``progress`` is called with (epochs done,
+    epochs in all). A ValueError: features without a gradient.
     """
-    if targets.shape != probabilities.shape:
-        raise ValueError(f"targets {targets.shape} and probabilities {probabilities.shape} must be alike")
-    positive, negative = (targets == 1).astype(np.float32), (targets == 0).astype(np.float32)
-    if kind == "classes":
-        right = probabilities.argmax(axis=1) == targets.argmax(axis=1)
-        hits, sizes = weights @ (positive * right[:, None]), weights @ positive
-        balanced = np.nanmean(_share(hits, sizes), axis=1)
-        return np.column_stack((hits.sum(axis=1) / sizes.sum(axis=1), balanced))
-    answered = probabilities > 0.5
-    yes, no = weights @ (positive * answered), weights @ (negative * ~answered)
-    positives, negatives = weights @ positive, weights @ negative
-    recalls = np.stack((_share(yes, positives), _share(no, negatives)))
-    accuracy = np.nanmean(_share(yes + no, positives + negatives), axis=1)
-    return np.column_stack((accuracy, np.nanmean(recalls, axis=0).mean(axis=1)))
+    device, ours = model.device, isinstance(model, Derenderer)
+    chosen = {name: model.nets[name] for name in factors} if ours else {"whole": model}
+    nets: Any = nn.ModuleDict(copy.deepcopy(chosen)).requires_grad_(True).train()
+
+    def embed(numbers: np.ndarray) -> torch.Tensor:
+        pictures = as_float(np.ascontiguousarray(images[numbers])).to(device)
+        parts = (
+            [net.encode(pictures) for net in nets.values()]
+            if ours
+            else nets["whole"].embed(pictures).values()
+        )
+        return torch.cat([*parts], dim=1)
+
+    generator = torch.Generator().manual_seed(seed)
+    targets = torch.from_numpy(task.targets).float().to(device)
+    first = embed(rows[:2])
+    if not first.requires_grad:
+        raise ValueError(f"features of {type(model).__name__} have no gradient: leave it out of finetune")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        head = nn.Linear(first.shape[1], targets.shape[1]).to(device)
+    optimiser = torch.optim.Adam([*nets.parameters(), *head.parameters()], lr=settings.learning_rate)
+    for epoch in range(settings.epochs):
+        order = torch.from_numpy(rows)[torch.randperm(len(rows), generator=generator)]
+        for batch in order.split(settings.batch_size):
+            logits, asked = head(embed(batch.numpy())), targets[batch.to(device)]
+            loss = head_loss(logits[None], asked[None], task.kind).sum()
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+        if progress is not None:
+            progress(epoch + 1, settings.epochs)
+    nets.eval()
+    with torch.inference_mode():
+        parts = np.array_split(tested, max(1, len(tested) // 256))
+        return np.concatenate([probabilities(head(embed(part)), task.kind).cpu().numpy() for part in parts])
 
 
-def _share(hits: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    return np.divide(hits, sizes, out=np.full_like(hits, np.nan), where=sizes > 0)
+def finetuned_answers(
+    models: Mapping[str, Sequence[ModelSource]],
+    ready: Prepared,
+    task: Task,
+    split: Rows,
+    seeds: Sequence[int],
+    settings: HeadSettings,
+    options: Options,
+    supervised: bool,
+) -> dict[str, dict[int, np.ndarray]]:
+    """By row name and number of labels, (S, T, A) answers: models, untrained ones, and other controls' heads.
+
+    Seed s trains run s of a model modulo their number; ``supervised`` adds a ResNet-18 with fresh weights.
+    ``options`` hold the images and the factors whose encoders are trained.
+    """
+
+    def answers(model: Any, count: int, at: int, what: str) -> np.ndarray:
+        rows, images = split.train[count][at], options.at(model.image_size, ready.table.files).images
+        own = [factor.name for factor in model.factors] if isinstance(model, Derenderer) else model.chosen
+        chosen = list((isinstance(model, Derenderer) and options.chosen) or own)
+        inputs = {
+            "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
+            "rows": rows, "tested": split.test, "seed": seeds[at], "factors": chosen,
+            "settings": settings.model_dump(),
+        }  # fmt: skip
+        progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
+        how: dict[str, Any] = {"seed": seeds[at], "settings": settings, "progress": progress}
+        learn = partial(finetune, model, images, task, rows, split.test, factors=chosen, **how)
+        return options.memory.recall_one("finetuned", inputs, learn)
+
+    trained = {name: [opened(run, options.device) for run in runs] for name, runs in models.items()}
+    first = next((run for runs in trained.values() for run in runs if isinstance(run, Derenderer)), None)
+    if first is not None:
+        trained[UNTRAINED] = [untrained_twin(first, seed) for seed in seeds]
+    if supervised:
+        from derender.baselines.supervised import fresh_resnet18
+
+        size = next(iter(trained.values()))[0].image_size
+        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device_named(options.device)) for seed in seeds]
+    found = {
+        name: {
+            count: np.stack([answers(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
+            for count in split.train
+        }
+        for name, runs in trained.items()
+    }
+    for name in ready.controls:
+        if not name.startswith(UNTRAINED):
+            found[name] = {
+                count: probe_runs(
+                    "linear", ready.features[name], task, rows, split.test, seeds, settings, options.memory
+                )
+                for count, rows in split.train.items()
+            }
+    return found

@@ -1,4 +1,4 @@
-"""What a linear probe is asked: targets from label columns, rows to learn from and rows to be tested on.
+"""The question of a linear probe: targets from label columns, rows to learn from and to be tested on, scores.
 
 Columns of two values each are asked together, each by a yes or no of its own (multi-label, as CelebA's 40
 attributes). One column of more values is asked as a choice of one (multi-class). The test rows are fixed: no
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sklearn.metrics import average_precision_score
 
 from derender.data import split_indices
 from derender.features import missing
@@ -126,21 +127,68 @@ def divide_rows(
 
 def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
     """The distinct values of a column, sorted, and (N,) their numbers, -1 where missing."""
-    known = ~missing(values)
-    distinct = sorted(set(values[known].tolist()))
+    known, numbers = ~missing(values), np.full(len(values), -1, np.int64)
+    distinct, numbers[known], counts = np.unique(values[known], return_inverse=True, return_counts=True)
     if len(distinct) < 2:
         raise ValueError(
             f"a linear probe needs at least two classes, the {int(known.sum())} labelled rows of {name!r} "
             f"have {len(distinct)}: choose another label column"
         )
-    number = {value: at for at, value in enumerate(distinct)}
-    numbers = np.full(len(values), -1, np.int64)
-    numbers[known] = [number[value] for value in values[known].tolist()]
-    counts = np.bincount(numbers[known])
     if counts.min() < 2:
         raise ValueError(
-            f"class {distinct[counts.argmin()]!r} of label {name!r} has one row, which cannot be both "
-            "learned and tested: leave this class out (where there is --min-count, give 2), or choose "
+            f"class {distinct.tolist()[counts.argmin()]!r} of label {name!r} has one row, which cannot be "
+            "both learned and tested: leave this class out (where there is --min-count, give 2), or choose "
             "another label"
         )
-    return distinct, numbers
+    return distinct.tolist(), numbers
+
+
+@dataclass(frozen=True)
+class LinearScores:
+    """How right answers are, 0..1, best 1.
+
+    Share of right answers (at threshold 0.5, or of the likeliest class) and its mean over the rows of each
+    value or class. Then area under precision over recall of each.
+    """
+
+    accuracy: float
+    balanced_accuracy: float
+    average_precision: float
+
+
+def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> LinearScores:
+    """Score (T, A) probabilities against (T, A) targets in -1 (unknown), 0, 1; one-hot for classes.
+
+    Values and classes that no row has do not count.
+    """
+    accuracy, balanced = count_scores(targets, probabilities, kind, np.ones((1, len(targets)), np.float32))[0]
+    columns = [(t, t >= 0, p) for t, p in zip(targets.T, probabilities.T, strict=True) if (t == 1).any()]
+    precisions = [average_precision_score(truth[known], answer[known]) for truth, known, answer in columns]
+    precision = float(np.mean(precisions)) if precisions else float("nan")
+    return LinearScores(float(accuracy), float(balanced), precision)
+
+
+def count_scores(
+    targets: np.ndarray, probabilities: np.ndarray, kind: str, weights: np.ndarray
+) -> np.ndarray:
+    """Accuracy and balanced accuracy, (B, 2), of ``linear_scores`` on resamples: (B, T) times each is
+    drawn.
+    """
+    if targets.shape != probabilities.shape:
+        raise ValueError(f"targets {targets.shape} and probabilities {probabilities.shape} must be alike")
+    positive, negative = (targets == 1).astype(np.float32), (targets == 0).astype(np.float32)
+    if kind == "classes":
+        right = probabilities.argmax(axis=1) == targets.argmax(axis=1)
+        hits, sizes = weights @ (positive * right[:, None]), weights @ positive
+        balanced = np.nanmean(_share(hits, sizes), axis=1)
+        return np.column_stack((hits.sum(axis=1) / sizes.sum(axis=1), balanced))
+    answered = probabilities > 0.5
+    yes, no = weights @ (positive * answered), weights @ (negative * ~answered)
+    positives, negatives = weights @ positive, weights @ negative
+    recalls = np.stack((_share(yes, positives), _share(no, negatives)))
+    accuracy = np.nanmean(_share(yes + no, positives + negatives), axis=1)
+    return np.column_stack((accuracy, np.nanmean(recalls, axis=0).mean(axis=1)))
+
+
+def _share(hits: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    return np.divide(hits, sizes, out=np.full_like(hits, np.nan), where=sizes > 0)

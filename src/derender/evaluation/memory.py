@@ -14,9 +14,10 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter
 
 from derender.data import cache_folder
 from derender.storage.atomic import DamageNoticed, atomic_file
@@ -107,36 +108,23 @@ def packed(value: Any) -> Arrays:
     arrays: Arrays = {}
 
     def plain(one: Any) -> Any:
-        if isinstance(one, np.ndarray):
-            name = f"array {len(arrays)}"
-            arrays[name] = one
-            return {"array": name}
-        if dataclasses.is_dataclass(one):
-            return {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
-        return dict(one) if isinstance(one, Mapping) else one.item()
+        if not isinstance(one, np.ndarray):
+            return one.item()
+        arrays[name := f"array {len(arrays)}"] = one
+        return {"array": name}
 
-    return {"value": np.array(json.dumps(value, default=plain)), **arrays}
+    return {"value": np.array(json.dumps(dataclasses.asdict(value), default=plain)), **arrays}
 
 
 def unpacked(kind: type[T], arrays: Mapping[str, np.ndarray]) -> T:
     """The inverse of ``packed``; the annotations of ``kind`` say which dataclasses are inside."""
-    return _built(kind, json.loads(str(arrays["value"])), arrays)
 
+    def whole(one: dict[str, Any]) -> Any:
+        return arrays[one["array"]] if set(one) == {"array"} else one
 
-def _built(kind: Any, value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    if isinstance(value, list):
-        return tuple(value)
-    if not isinstance(value, dict):
-        return value
-    if set(value) == {"array"}:
-        return arrays[value["array"]]
-    known = [
-        one for one in (kind, *get_args(kind)) if isinstance(one, type) and dataclasses.is_dataclass(one)
-    ]
-    if not known:
-        return value
-    hints = get_type_hints(known[0])
-    return known[0](**{name: _built(hints[name], one, arrays) for name, one in value.items()})
+    holder: Any = tuple[kind]  # pyright: ignore[reportInvalidTypeForm]
+    adapter = TypeAdapter(holder, config=ConfigDict(arbitrary_types_allowed=True))
+    return adapter.validate_python([json.loads(str(arrays["value"]), object_hook=whole)])[0]
 
 
 def _read(file: Path) -> Arrays | None:

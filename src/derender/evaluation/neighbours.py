@@ -6,7 +6,7 @@ the first counts. Above ``EXACT_ROWS`` rows a row is compared with those of its 
 
 ``cells`` puts near rows together. Centres come from a few rounds of k-means (Lloyd 1982) over a sample; every
 row goes to its nearest centre. Cells that came out too large are divided again. Approximate by nature: rows
-on two sides of a border do not see each other. Nothing is random but for the seed.
+on two sides of a border do not see each other.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -81,7 +81,7 @@ def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         look(np.arange(len(points)), slice(None), np.arange(len(points)))
         return nearest, distance
     points = points.astype(np.float32, copy=False)
-    groups = members(cells(points, CELL_ROWS))
+    groups = cells(points, CELL_ROWS)
     centres = np.stack([points[rows].mean(axis=0) for rows in groups])
     square = (centres**2).sum(axis=1)
     apart = square[:, None] + square - 2 * centres @ centres.T
@@ -98,17 +98,14 @@ def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return nearest, distance
 
 
-def cells(
-    points: Float32[np.ndarray, "n d"], rows_per_cell: int = CELL_ROWS, seed: int = 0
-) -> Int64[np.ndarray, " n"]:
-    """The cell of each row, (N,) integers from 0 without gaps; near rows mostly share one."""
-    number = np.zeros(len(points), np.int64)
-    waiting, made = [np.arange(len(points))], 0
-    generator = np.random.default_rng(seed)
+def cells(points: Float32[np.ndarray, "n d"], rows_per_cell: int) -> list[Int64[np.ndarray, " rows"]]:
+    """The rows of each cell, in ascending order; near rows mostly share a cell."""
+    groups, waiting = [], [np.arange(len(points))]
+    generator = np.random.default_rng(0)
     while waiting:
         rows = waiting.pop()
         if len(rows) <= rows_per_cell:
-            number[rows], made = made, made + 1
+            groups.append(rows)
             continue
         wanted = -(-len(rows) // rows_per_cell)
         sampled = generator.choice(rows, min(len(rows), _SAMPLED_PER_CELL * wanted), replace=False)
@@ -117,17 +114,8 @@ def cells(
         if len(parts) == 1:  # copies of one row: no centre tells them apart
             parts = np.array_split(rows, wanted)
         for part in parts:
-            if len(part) > 4 * rows_per_cell:
-                waiting.append(part)
-            else:
-                number[part], made = made, made + 1
-    return number
-
-
-def members(number: Int64[np.ndarray, " n"]) -> list[Int64[np.ndarray, " rows"]]:
-    """The rows of each cell, in ascending order."""
-    order = np.argsort(number, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(number))[:-1])
+            (waiting if len(part) > 4 * rows_per_cell else groups).append(part)
+    return groups
 
 
 def of_each(work: Callable[[int], T], groups: Sequence[np.ndarray]) -> Iterator[T]:

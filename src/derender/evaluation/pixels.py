@@ -105,11 +105,8 @@ def reconstruction_scores(
 
 
 def mean_image(images: np.ndarray) -> Float[Tensor, "3 h w"]:
-    """The mean of uint8 images (N, 3, H, W), in 0..1; reads a memory map a part at a time."""
-    total = np.zeros(images.shape[1:])
-    for start in range(0, len(images), 1024):
-        total += images[start : start + 1024].sum(axis=0, dtype=np.float64)
-    return torch.from_numpy((total / len(images) / 255).astype(np.float32))
+    """The mean of uint8 images (N, 3, H, W), in 0..1."""
+    return torch.from_numpy((images.mean(axis=0, dtype=np.float64) / 255).astype(np.float32))
 
 
 def evaluate_reconstruction(
@@ -151,9 +148,9 @@ def evaluate_reconstruction(
     )
 
 
-def component_count(images: int) -> int:
-    """Number of components from so many images: 64, and at most a quarter of their number."""
-    return max(1, min(COMPONENTS, images // 4))
+def component_count(images: int, most: int = COMPONENTS) -> int:
+    """Number of principal components from so many images: at most a quarter of their number."""
+    return max(1, min(most, images // 4))
 
 
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:

@@ -148,11 +148,10 @@ class ScoreTable:
         for place, column in enumerate(self.columns):
             cells = [row.cells[place] for row in self.rows]
             if any(isinstance(cell, Interval) for cell in cells):
-                both = [cell if isinstance(cell, Interval) else Interval(NAN, NAN) for cell in cells]
-                ends = {"low": [one.low for one in both], "high": [one.high for one in both]}
+                for end in Interval._fields:
+                    data[f"{column.of} {end}".lstrip()] = [getattr(cell, end, NAN) for cell in cells]
             else:
-                ends = {column.name: cells}
-            data |= {f"{column.of} {end}".lstrip(): values for end, values in ends.items()}
+                data[f"{column.of} {column.name}".lstrip()] = cells
         names = pandas.Index([row.name for row in self.rows], name=self.first)
         return pandas.DataFrame({**data, "control": [row.control for row in self.rows]}, index=names)
 
@@ -301,12 +300,7 @@ def _latex(text: str) -> str:
 
 
 _LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        **{letter: rf"\{letter}" for letter in "{}$&#%_"},
-        "^": r"\textasciicircum{}",
-        "~": r"\textasciitilde{}",
-        "±": r"$\pm$",
-        "≥": r"$\geq$",
-    }
+    {letter: rf"\{letter}" for letter in "{}$&#%_"}
+    | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"}
+    | {"±": r"$\pm$", "≥": r"$\geq$"}
 )

@@ -9,14 +9,9 @@ from typing import Any
 from derender.baselines import baseline_config, image_size_of, read_any_config, stored_config, train_baseline
 from derender.data import ImageSet
 from derender.evaluation.feature_rows import attribute_columns
-from derender.evaluation.finetuning import (
-    FinetuneScores,
-    FinetuneTask,
-    load_finetuned,
-    score_finetuned,
-    target_of,
-)
+from derender.evaluation.finetuning import FinetuneTask, load_finetuned, score_finetuned, target_of
 from derender.evaluation.memory import Memory
+from derender.evaluation.score_table import Scores
 from derender.inputs import as_images, as_model, device_named
 from derender.training import derender_task
 from derender.training.config import PRESETS, FinetuneConfig, TrainConfig, as_overrides, resolve, with_changes
@@ -154,7 +149,7 @@ class Finetuned:
     """A joint training with labels: how it ended, scores of its test part, the model it began with."""
 
     run: TrainResult
-    scores: FinetuneScores
+    scores: Scores
     start: str | None
 
 
@@ -253,6 +248,7 @@ def finetune(
         raise ValueError(f"{out} has no model: training collapsed before the first held-out score")
     tuned = load_finetuned(out, device=accelerator)
     scores = score_finetuned(
-        tuned, task, memory=memory, progress=lambda *counts: report(Progress("scoring", *counts))
-    )
+        tuned, task, began=config.start or "fresh weights", memory=memory,
+        progress=lambda *counts: report(Progress("scoring", *counts)),
+    )  # fmt: skip
     return Finetuned(run, scores, config.start)

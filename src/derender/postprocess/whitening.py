@@ -165,7 +165,11 @@ class Whitening(nn.Module):
     @classmethod
     def load(cls, file: Path) -> "Whitening":
         """Read what ``save`` wrote; damage, or tensors that are missing or do not fit, is a ValueError."""
-        tensors = read_tensors(file)
+        return cls.of(read_tensors(file))
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor]) -> "Whitening":
+        """The projections whose ``named_buffers`` these are; one that does not fit is a ValueError."""
         projections = {}
         for name in [key.removesuffix("_map") for key in tensors if key.endswith("_map")]:
             try:

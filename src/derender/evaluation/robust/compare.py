@@ -33,8 +33,7 @@ from derender.evaluation.feature_rows import (
     prepare,
 )
 from derender.evaluation.linear_probes import PAPER_HEAD, PROBES, majority_answers, probe_runs
-from derender.evaluation.linear_probing import count_scores
-from derender.evaluation.linear_task import divide_rows, task_of
+from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.robust import sources
