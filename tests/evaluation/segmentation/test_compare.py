@@ -201,4 +201,3 @@ def test_resamples_are_scores_of_the_pictures_drawn_with_the_same_ten_classes():
     found = scores(answers[drawn], masks[drawn])
     expected = [found.mean_iou, found.mean_iou, found.pixel_accuracy]
     assert resampled_scores(counts, weights)[0] == pytest.approx(expected)
-    assert set(compare.best_classes(counts)) == {0, 1, 2} and len(compare.best_classes(counts, 2)) == 2

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
 from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
+    group_resamples,
     numbers_of,
-    resamples,
     scored_row,
     with_verdicts,
 )
@@ -248,10 +249,9 @@ def level_name(level: float) -> str:
 
 def area_under(levels: Sequence[float], values: np.ndarray) -> np.ndarray:
     """Area under (..., L) values over L growing levels, divided by their range; by trapezia."""
-    x, y = np.asarray(levels, np.float64), np.asarray(values, np.float64)
-    if len(x) < 2 or (np.diff(x) <= 0).any():
+    if len(levels) < 2 or (np.diff(levels) <= 0).any():
         raise ValueError(f"an area needs two growing levels or more, got {list(levels)}")
-    return np.asarray(((y[..., 1:] + y[..., :-1]) / 2 * np.diff(x)).sum(axis=-1) / (x[-1] - x[0]))
+    return np.asarray(trapezoid(values, levels, axis=-1) / (levels[-1] - levels[0]))
 
 
 def compare_robustness(
@@ -277,30 +277,24 @@ def compare_robustness(
     check_lengths(features, len(task))
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
-    shared: dict[bytes, list[Curve]] = {}  # curves that learn from the same rows
+    tested = np.unique(np.concatenate([rows for curve in trial.curves for rows in curve.points]))
+    known: dict[bytes, dict[str, np.ndarray]] = {}  # answers by training rows: most curves share these
+    total, curves, n_learned = len({one.learn.tobytes() for one in trial.curves}) * len(features), [], {}
     for curve in trial.curves:
-        shared.setdefault(curve.learn.tobytes(), []).append(curve)
-    total, done, results, n_learned = len(shared) * len(features), 0, {}, {}
-    for curves in shared.values():
-        learn = curves[0].learn
-        count = max(5, round(LEARNED_SHARE * len(learn)))
-        draws = np.stack([np.random.default_rng(one).permutation(learn)[:count] for one in seeds])
-        tested = np.unique(np.concatenate([rows for curve in curves for rows in curve.points]))
-        answers = {}
-        for name, arrays in features.items():
-            answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
-            done += 1
-            if progress is not None:
-                progress(done, total)
-        answers["majority"] = majority_answers(task, draws, len(tested))
-        for curve in curves:
-            rows = _scored(curve, trial, answers, tested, {*controls, "majority"}, resample_count, seed)
-            sizes = tuple(map(len, curve.points))
-            results[curve.name] = CurveResult(curve.name, curve.title, curve.levels, sizes, rows)
-            n_learned[curve.name] = count
-    ordered = tuple(results[curve.name] for curve in trial.curves)
+        count = n_learned[curve.name] = max(5, round(LEARNED_SHARE * len(curve.learn)))
+        draws = np.stack([np.random.default_rng(one).permutation(curve.learn)[:count] for one in seeds])
+        answers = known.setdefault(curve.learn.tobytes(), {})
+        if not answers:
+            for name, arrays in features.items():
+                answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
+                if progress is not None:
+                    progress(sum(map(len, known.values())), total)
+        both = {**answers, "majority": majority_answers(task, draws, len(tested))}
+        rows = _scored(curve, trial, both, tested, {*controls, "majority"}, resample_count, seed)
+        sizes = tuple(map(len, curve.points))
+        curves.append(CurveResult(curve.name, curve.title, curve.levels, sizes, rows))
     return RobustnessComparison(
-        ordered, trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
+        tuple(curves), trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
     )
 
 
@@ -317,7 +311,10 @@ def _scored(
     truths = [trial.task.targets[rows] for rows in curve.points]
     places = [np.searchsorted(tested, rows) for rows in curve.points]
     once = [np.ones((1, len(rows)), np.float32) for rows in curve.points]
-    weights = _weights(curve, trial.unit, count, seed)
+    units = [trial.unit[rows] for rows in curve.points]
+    draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
+    seeds = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
+    weights = [group_resamples(own, count, one) for own, one in zip(units, seeds, strict=True)]
     names = (ORDINARY, AREA, *map(level_name, curve.levels))
 
     def scores(run: np.ndarray, drawn: Sequence[np.ndarray]) -> np.ndarray:
@@ -338,19 +335,3 @@ def _scored(
             both = with_area(plain[:, :, at]), with_area(resampled[:, :, at])
             rows.append(scored_row(name, name in controls, names, *both))
     return {score: with_verdicts(rows) for score, rows in found.items()}
-
-
-def _weights(curve: Curve, unit: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
-    """For every point, (B, T) how often each of its rows is drawn: as often as its unit.
-
-    Points with the same units share their resamples; others have their own, so that none is ever empty.
-    """
-    drawn: dict[bytes, np.ndarray] = {}
-    found = []
-    for rows in curve.points:
-        names, number = np.unique(unit[rows], return_inverse=True)
-        key = names.tobytes()
-        if key not in drawn:
-            drawn[key] = np.concatenate(list(resamples(len(names), count, seed + 1_000 * len(drawn))))
-        found.append(drawn[key][:, number])
-    return found

@@ -25,7 +25,7 @@ from derender.data import ImageSet
 from derender.data.synthetic import CarSettings, FaceSettings, SyntheticSet, cars, faces
 from derender.evaluation.linear_task import Task, task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust.trial import Axis, Curve, Trial, all_angles, checked_levels, stacked_trial
+from derender.evaluation.robust.trial import Axis, Curve, Trial, all_angles, stacked_trial
 from derender.features import Progress, map_batches, missing, model_fingerprint, named
 from derender.settings import Settings
 from derender.training.step import fill_uncovered
@@ -67,7 +67,6 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        named(KINDS, self.kind, "kind")
         if self.people < 2 or self.learned < 1 or self.tested < 1:
             raise ValueError(
                 f"generated images need two people or more, each with an image to learn from and one to "
@@ -97,13 +96,12 @@ class Recipe:
 def generated_trial(
     recipe: Recipe,
     axes: Sequence[Axis],
-    levels: Sequence[float],
+    levels: tuple[float, ...],
     *,
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> Trial:
     """Generate the images, or find them in the cache."""
-    levels = checked_levels(levels, axes)
     sample = recipe.generate("tested", 1)
     named({"identity": sample.identity, **sample.labels}, recipe.label, f"label of generated {recipe.kind}")
     inputs = {
@@ -154,7 +152,7 @@ def rendered_trial(
     learn: np.ndarray,
     test: np.ndarray,
     axes: Sequence[Axis],
-    levels: Sequence[float],
+    levels: tuple[float, ...],
     *,
     groups: np.ndarray | None = None,
     memory: Memory | None = None,
@@ -165,7 +163,6 @@ def rendered_trial(
     ``learn`` and ``test`` are row numbers, ``levels`` degrees. Images of one of the (N,) ``groups``, such as
     identities, are resampled together; an image without one, and all without groups, by itself.
     """
-    levels = checked_levels(levels, axes)
     asked, rows = all_angles(axes, levels), np.concatenate((learn, test))
     inputs = {
         "weights": model_fingerprint(model), "images": pictures.images[rows], "n_learn": len(learn),
@@ -230,4 +227,4 @@ def _curve(axis: Axis, angle: np.ndarray, unit: np.ndarray, task: Task, portions
             f"the true {axis.title} cannot be cut into {portions} portions of growing angle: the images "
             "are too few, or all at one angle"
         )
-    return Curve(axis.name, f"true {axis.title}", learn, tested[0], levels, tested)
+    return Curve(axis.name, f"true {axis.title}", learn, levels, (tested[0], *tested))
