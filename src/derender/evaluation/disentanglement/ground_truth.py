@@ -17,7 +17,7 @@ factor; ``placed`` does. True factors are the labels of a rendered set: numbers 
 names become classes (identity, expression, kind of car).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -142,11 +142,10 @@ def ground_truth_scores(
     """
     blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
-    found = [_predicted(x, factors, seed) for x in (*blocks.values(), everything)]
-    score, gain = (np.array([[one[part] for one in row] for row in found]) for part in (0, 1))
+    found = (_predicted(x, factors, seed) for x in (*blocks.values(), everything))
+    score, gain, bins = map(np.stack, zip(*found, strict=True))
     share, informativeness = gain[:-1], float(gain[-1].mean())
-    bins = [np.stack([row[k][2] for row in found[:-1]], axis=1) for k in range(len(factors))]
-    mig = float(np.mean([_information_gap(each, factor) for each, factor in zip(bins, factors, strict=True)]))
+    mig = float(np.mean([_information_gap(bins[:-1, k].T, factor) for k, factor in enumerate(factors)]))
     owned = [k for k, factor in enumerate(factors) if set(factor.belongs_to) & set(names)]
     right = [share[:, k].max() > 0 and names[share[:, k].argmax()] in factors[k].belongs_to for k in owned]
     by_dimension = grouped = None
@@ -244,10 +243,8 @@ def _read(column: np.ndarray, name: str, features: tuple[str, ...]) -> TrueFacto
     return "one class only" if count < 2 else f"{count:,} classes of {len(column):,} images"
 
 
-def _predicted(
-    x: np.ndarray, factors: Sequence[TrueFactor], seed: int
-) -> list[tuple[float, float, np.ndarray]]:
-    """For each factor: score, score above chance in 0..1, and the (N,) binned prediction from one feature."""
+def _predicted(x: np.ndarray, factors: Sequence[TrueFactor], seed: int) -> Iterable[tuple[Any, ...]]:
+    """From one feature, by factor: scores, (K,), those above chance in 0..1, binned predictions, (K, N)."""
     every = np.concatenate([factor.targets for factor in factors], axis=1)
     ends = np.cumsum([factor.targets.shape[1] for factor in factors])[:-1]
     answers = np.split(held_out(x, every, seed=seed), ends, axis=2)
@@ -261,7 +258,7 @@ def _predicted(
             left, total = (np.square(each - factor.targets).sum() for each in (answer, constant))
             score = float(1 - left / total)
         found.append((score, max(0.0, (score - largest) / (1 - largest)), bins))
-    return found
+    return zip(*found, strict=True)
 
 
 def _lasso(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:
