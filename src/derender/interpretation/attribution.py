@@ -61,14 +61,12 @@ def integrated_gradients(
     *,
     baseline: np.ndarray | None = None,
     output: str = "logit",
-    steps: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The contribution of each dimension to one answer, from the baseline to the image.
 
     ``features`` are (N, D), ``target`` is the number of the label or class. ``baseline`` (D,) is zero by
-    default, as in the paper. ``output`` is "logit" or "probability". ``steps`` of the Gauss-Legendre
-    quadrature are as many as that needs. Returns (N, D) attributions, and (N,) completeness errors: their sum
-    less the change of the answer.
+    default, as in the paper. ``output`` is "logit" or "probability". Returns (N, D) attributions, and (N,)
+    completeness errors: their sum less the change of the answer.
     """
     require_known("output", output, OUTPUTS)
     if features.ndim != 2 or features.shape[1] != probe.weight.shape[1]:
@@ -83,21 +81,15 @@ def integrated_gradients(
             return logits[:, 0]
         return logits.softmax(dim=1)[:, target] if together else logits[:, 0].sigmoid()
 
-    steps = STEPS[output] if steps is None else steps
-    method = captum_attr().IntegratedGradients(answer)
-    start = torch.zeros(1, features.shape[1], dtype=torch.float64)
-    if baseline is not None:
-        start = torch.from_numpy(np.asarray(baseline, np.float64)).reshape(1, -1)
-    portion = max(1, NUMBERS_AT_ONCE // (steps * features.shape[1]))
-    found, errors = [], []
-    for first in range(0, len(features), portion):
-        z = torch.from_numpy(features[first : first + portion].astype(np.float64))
-        attribution, delta = method.attribute(z, start, n_steps=steps, return_convergence_delta=True)
-        found.append(attribution.detach().numpy())
-        errors.append(delta.detach().numpy())
-    if not found:
-        return np.zeros((0, features.shape[1])), np.zeros(0)
-    return np.concatenate(found), np.concatenate(errors)
+    method, z = captum_attr().IntegratedGradients(answer), torch.from_numpy(features.astype(np.float64))
+    if not len(z):
+        return np.zeros(features.shape), np.zeros(0)
+    start = z.new_zeros(1, z.shape[1]) if baseline is None else z.new_tensor(baseline[None])
+    found, error = method.attribute(
+        z, start, n_steps=STEPS[output], return_convergence_delta=True,
+        internal_batch_size=max(len(z), NUMBERS_AT_ONCE // z.shape[1]),
+    )  # fmt: skip
+    return found.detach().numpy(), error.detach().numpy()
 
 
 def factor_shares(attributions: np.ndarray, probe: Probe) -> np.ndarray:
@@ -123,9 +115,12 @@ def saliency(
     length).
     """
     require_known("method", method, METHODS)
-    weight = None if probe is None else factor_weights(probe, factor, targets).to(images)
-    if weight is not None and len(weight) != len(images):
-        raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
+    weight = None
+    if probe is not None:
+        columns = named(probe.slices, factor, "factor of the probe")
+        weight = torch.from_numpy(probe.weight[np.asarray(targets, np.int64), columns]).to(images)
+        if len(weight) != len(images):
+            raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
     if method == "pixels":
         return pixel_attribution(model, images, factor, weight)[0]
     features, gradient = _at_features(model, images, factor, weight)
@@ -134,12 +129,6 @@ def saliency(
     maps = (gradient * features).sum(dim=1)
     own, mirror = maps[: len(images)], maps[len(images) :]
     return (own + mirror.flip(-1) if len(mirror) else own).relu()
-
-
-def factor_weights(probe: Probe, factor: str, targets: Sequence[int] | np.ndarray) -> Float[Tensor, "n code"]:
-    """The probe's weights on one factor's feature, for the target of each image."""
-    columns = named(probe.slices, factor, "factor of the probe")
-    return torch.from_numpy(probe.weight[np.asarray(targets, np.int64), columns])
 
 
 def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " n"]:
@@ -217,13 +206,6 @@ class Similarity:
     spread: float
     empty: float
 
-    @property
-    def trusted(self) -> bool | None:
-        """Whether new weights change the map; None where that was not measured."""
-        if self.changed != "random weights" or not np.isfinite(self.spearman):
-            return None
-        return self.spearman < UNCHANGED
-
 
 def sanity_check(
     model: Any,
@@ -269,9 +251,9 @@ def similarity(
     ranks = np.concatenate([spearman(own, other) for other in others])
     ssim = np.concatenate([_ssim(own, other, size) for other in others])
     known = np.isfinite(ranks)
-    if not known.any():
-        return Similarity(method, factor, changed, float("nan"), float("nan"), float("nan"), 1.0)
-    means = float(ranks[known].mean()), float(ssim[known].mean()), float(ranks[known].std())
+    means = [float("nan")] * 3
+    if known.any():
+        means = [float(ranks[known].mean()), float(ssim[known].mean()), float(ranks[known].std())]
     return Similarity(method, factor, changed, *means, float(1 - known.mean()))
 
 

@@ -66,9 +66,8 @@ class Explained:
         shown += [tables.sanity_table(self.checks)] if self.checks else []
         shown += [tables.cluster_share_table(self.clusters)] if self.clusters is not None else []
         shown += [tables.pair_table(self.pair[1], self.pair[0])] if self.pair is not None else []
-        stuck = (
-            f"not to be trusted, fresh weights give the same map: {m}" for m in tables.untrusted(self.checks)
-        )
+        same = tables.unchanged(self.checks, "random weights")
+        stuck = (f"not to be trusted, fresh weights give the same map: {name}" for name in same)
         values = {"source": self.images.source, "sanity": self.checks, "clusters": self.clusters}
         values |= {**self.shares.numbers(), "pair": None if self.pair is None else self.pair[1]}
         return Scores(shown, values, [*tables.share_verdicts(self.shares), *stuck])
@@ -263,26 +262,20 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
 
 def _row(name: str, runs: Sequence[tuple[np.ndarray, ...]]) -> ShareRow:
     shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
-    ends, (error, scale) = _interval(_mean(shares)), largest.max(axis=0)
+    known = np.ma.masked_invalid(shares)
+    per_seed, low_high = known.mean(axis=1).filled(np.nan), _interval(known.mean(axis=0))
+    error, scale = largest.max(axis=0)
     error = float(error / scale) if scale > 0 else 0.0
-    per_seed = np.stack([_mean(each) for each in shares])
-    return ShareRow(name, name != "model", per_seed, ends[0], ends[1], auc, drop, error)
+    return ShareRow(name, name != "model", per_seed, *low_high, auc, drop, error)
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is no NaN; NaN where nothing is."""
-    known = np.isfinite(values)
-    count, total = known.sum(axis=0), np.where(known, values, 0).sum(axis=0)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def _interval(shares: np.ndarray) -> np.ndarray:
+def _interval(shares: np.ma.MaskedArray) -> np.ndarray:
     """(T, A, F) as the ends of the 95 % interval of the mean over images, (2, A, F)."""
-    known = np.isfinite(shares).reshape(len(shares), -1).astype(np.float32)
-    values = np.where(np.isfinite(shares), shares, 0).reshape(len(shares), -1).astype(np.float32)
+    flat = shares.reshape(len(shares), -1)
     weights = np.concatenate(list(resamples(len(shares), BOOTSTRAP)))
-    count = weights @ known
-    drawn = np.divide(weights @ values, count, out=np.full(count.shape, np.nan), where=count > 0)
+    count = weights @ (~flat.mask).astype(np.float32)
+    total = weights @ flat.filled(0).astype(np.float32)
+    drawn = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
     ends, some = np.full((2, drawn.shape[1]), np.nan), np.isfinite(drawn).any(axis=0)
     ends[:, some] = np.nanquantile(drawn[:, some], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
     return ends.reshape(2, *shares.shape[1:])

@@ -270,20 +270,15 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
             for changed in ("random weights", "shuffled labels", "another image")
         )
         assert fresh is not None
-        word = {True: "yes", False: "no", None: "-"}[fresh.trusted]
+        word = "yes" if fresh.spearman < UNCHANGED else "no"
         cells = (fresh.spearman, fresh.ssim, labels and labels.spearman, other and other.spearman)
-        lines.append(Row(f"{method}, {factor}", (*cells, fresh.empty, word)))
+        lines.append(Row(f"{method}, {factor}", (*cells, fresh.empty, word if fresh.empty < 1 else "-")))
     return ScoreTable("Do maps change with the learned weights? Similarity, -1 to 1", "map", columns, lines)
 
 
-def untrusted(rows: Sequence[Similarity]) -> list[str]:
-    """The maps that do not change with fresh weights."""
-    return [f"{row.method}, {row.factor}" for row in rows if row.trusted is False]
-
-
-def unasked(rows: Sequence[Similarity]) -> list[str]:
-    """The maps that do not change when the probe learned shuffled labels."""
-    stuck = [row for row in rows if row.changed == "shuffled labels" and row.spearman >= UNCHANGED]
+def unchanged(rows: Sequence[Similarity], changed: str) -> list[str]:
+    """The maps that stay the same after a change, such as "random weights": not to be trusted."""
+    stuck = [row for row in rows if row.changed == changed and row.spearman >= UNCHANGED]
     return [f"{row.method}, {row.factor}" for row in stuck]
 
 
@@ -295,9 +290,8 @@ def cluster_share_table(found: ClusterShares) -> ScoreTable:
     )
     columns = [column for factor in found.factors for column in (Column(factor, note=share), ratio)]
     rows = []
-    for name, size, *parts in zip(
-        found.names, found.sizes, found.share, found.ratio, found.chance, strict=True
-    ):
+    columns_of = (found.names, found.sizes, found.share, found.ratio, found.chance)
+    for name, size, *parts in zip(*columns_of, strict=True):
         cells: list[Cell] = [int(size)]
         for own, between, chance in zip(*parts, strict=True):
             cells += [float(own), f"{between:.3f} ({chance:.3f})"]
@@ -323,5 +317,4 @@ def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
 
 def _means(values: np.ndarray) -> list[float | None]:
     """(S, A, F) as the mean of what is finite for each factor."""
-    known = [part[np.isfinite(part)] for part in values.reshape(-1, values.shape[-1]).T]
-    return [float(part.mean()) if len(part) else None for part in known]
+    return np.ma.masked_invalid(values).mean(axis=(0, 1)).tolist()
