@@ -251,10 +251,10 @@ def similarity(
     ranks = np.concatenate([spearman(own, other) for other in others])
     ssim = np.concatenate([_ssim(own, other, size) for other in others])
     known = np.isfinite(ranks)
-    means = [float("nan")] * 3
+    mean = alike = spread = float("nan")
     if known.any():
-        means = [float(ranks[known].mean()), float(ssim[known].mean()), float(ranks[known].std())]
-    return Similarity(method, factor, changed, *means, float(1 - known.mean()))
+        mean, alike, spread = map(float, (ranks[known].mean(), ssim[known].mean(), ranks[known].std()))
+    return Similarity(method, factor, changed, mean, alike, spread, float(1 - known.mean()))
 
 
 def spearman(first: Tensor, second: Tensor) -> np.ndarray:

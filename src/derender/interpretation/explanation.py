@@ -263,10 +263,10 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
 def _row(name: str, runs: Sequence[tuple[np.ndarray, ...]]) -> ShareRow:
     shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
     known = np.ma.masked_invalid(shares)
-    per_seed, low_high = known.mean(axis=1).filled(np.nan), _interval(known.mean(axis=0))
+    per_seed, (low, high) = known.mean(axis=1).filled(np.nan), _interval(known.mean(axis=0))
     error, scale = largest.max(axis=0)
     error = float(error / scale) if scale > 0 else 0.0
-    return ShareRow(name, name != "model", per_seed, *low_high, auc, drop, error)
+    return ShareRow(name, name != "model", per_seed, low, high, auc, drop, error)
 
 
 def _interval(shares: np.ma.MaskedArray) -> np.ndarray:
