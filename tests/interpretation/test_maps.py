@@ -82,8 +82,7 @@ def test_grad_cam_misleads_where_hires_cam_does_not(images):
 def test_pixels_sum_to_the_change_of_the_answer(images):
     """This network is linear where its ReLU is open, so the error is rounding."""
     weight = torch.ones(3, CODE)
-    maps, error = attribution.pixel_attribution(Looking("input"), images * 0.4 + 0.55, "geometry", weight)
-    assert error.max() < 1e-4
+    maps = attribution.pixel_attribution(Looking("input"), images * 0.4 + 0.55, "geometry", weight)
     encode = Looking("input").nets["geometry"].encode
     grey = torch.full_like(images, 0.5)
     change = score(encode(images * 0.4 + 0.55), weight) - score(encode(grey), weight)
@@ -181,4 +180,4 @@ def test_bad_words(model, probe, images, method, factor, targets, message):
     with pytest.raises(ValueError, match=message):
         saliency(method, model, images, factor, probe, targets)
     with pytest.raises(ValueError, match="2 images or more, got 1"):
-        sanity_check(model, probe, None, images[:1], np.zeros(1, np.int64))
+        sanity_check(model, probe, probe, images[:1], np.zeros(1, np.int64))

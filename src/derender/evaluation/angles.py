@@ -30,7 +30,6 @@ from derender.features import map_batches
 from derender.features.table import named
 from derender.inputs import as_model
 from derender.model import Derenderer
-from derender.scene import Scene
 from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, require_regular
 
 AGREEMENT = {
@@ -97,11 +96,7 @@ def pose(
     Raises:
         ValueError: neither labels nor a table hold the angles, or the table names none of the images.
     """
-
-    def predicted(scene: Scene) -> Tensor:
-        return torch.rad2deg(scene.camera[:, [1, 0, 2]])
-
-    return _angles("Pose", model, images, table, POSE, predicted, fit_steps, options)
+    return _angles("Pose", model, images, table, fit_steps, options)
 
 
 def light(
@@ -118,29 +113,29 @@ def light(
     the angle between both directions, by the angle between light and view. Arguments are those of ``pose``;
     a table has the columns ``azimuth`` and ``elevation``.
     """
-
-    def predicted(scene: Scene) -> Tensor:
-        return _spherical(light_in_camera(scene.light, scene.camera))
-
-    return _angles("Light", model, images, table, LIGHT, predicted, fit_steps, options)
+    return _angles("Light", model, images, table, fit_steps, options)
 
 
 def _angles(
-    what: str, model: Any, images: Any, table: Any, labels: Mapping[str, str], predicted: Any,
-    fit_steps: int | None, options: Mapping[str, Any],
-) -> Scores:  # fmt: skip
+    what: str, model: Any, images: Any, table: Any, fit_steps: int | None, options: Mapping[str, Any]
+) -> Scores:
+    labels = POSE if what == "Pose" else LIGHT
     how = Options(images=images, **{"keep_duplicates": True, **options})
     model = as_model(model, device=how.device)
     true, read = known_angles(how.at(model.image_size), table, labels)
     nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
 
-    def seen(net: Any, name: str) -> np.ndarray:
-        def see(batch: Tensor) -> np.ndarray:
-            return predicted(net.decompose(batch)).double().numpy(force=True)
+    found = {}
+    for name, net in nets.items():
 
-        return np.concatenate(map_batches(see, net, read.images, batch_size=64, progress=how.stage(name)))
+        def see(batch: Tensor, net: Any = net) -> np.ndarray:
+            scene = net.decompose(batch)
+            pose = torch.rad2deg(scene.camera[:, [1, 0, 2]])
+            angles = pose if what == "Pose" else _spherical(light_in_camera(scene.light, scene.camera))
+            return angles.double().numpy(force=True)
 
-    found = {name: seen(net, name) for name, net in nets.items()}
+        parts = map_batches(see, net, read.images, batch_size=64, progress=how.stage(name))
+        found[name] = np.concatenate(parts)
     people = read.labels.get("identity", np.array(read.files))
     weights = group_resamples(people.astype(str), how.resamples, how.seed)
     tables: list[ScoreTable] = []
@@ -151,26 +146,25 @@ def _angles(
         shown, values[name] = agreement_table(caption, answers, true[:, column], weights)
         tables.append(shown)
     if what == "Light":
-        extra, values["direction"] = _directions(found, true, people.astype(str), how)
-        tables.append(extra)
+        rows, columns = _directions(found, true, people.astype(str), how)
+        caption = "Light: degrees between true and predicted direction, by the angle between light and view"
+        tables.append(scored_table(caption, "prediction", rows, columns, deviations=()))
+        values["direction"] = numbers_of(rows)
     return Scores(tables, values, how.notes)
 
 
 def _directions(
     found: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
-) -> tuple[ScoreTable, dict[str, Any]]:
+) -> tuple[Sequence[ScoredRow], Mapping[str, Column]]:
     """Angle between true and predicted direction, all and by the angle between light and view."""
     aim = _unit(true)
     answers = {name: _unit(angles) for name, angles in found.items()}
     answers["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
     off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
     apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in answers.items()}
-    rows, columns, _ = binned_rows(
+    return binned_rows(
         apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
-    )
-    caption = "Light: degrees between true and predicted direction, by the angle between light and view"
-    numbers = numbers_of(rows)
-    return scored_table(caption, "prediction", rows, columns, deviations=()), numbers
+    )[:2]
 
 
 def known_angles(

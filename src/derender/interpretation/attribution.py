@@ -1,22 +1,18 @@
 """Attribution: each factor's share of an answer, and where in the image its encoder saw it.
 
 Shares: integrated gradients of a probe (Sundararajan et al., ICML 2017), computed by captum. A factor's
-share is that of Klinghoffer et al. (ECCV 2022, caption of the Grad-CAM figure): the sum of |IG| over its
-dimensions, over the sum of all. A zero baseline counts a feature that is large in every image, whether or not
-it distinguishes images; the mean as baseline does not.
+share (Klinghoffer et al., ECCV 2022) is the sum of |IG| over its dimensions, over the sum of all. A zero
+baseline counts a feature that is large in every image; the mean as baseline does not.
 
-Maps are of three kinds. Grad-CAM (Selvaraju et al., ICCV 2017) at the encoder's last spatial convolution is
-the paper's choice. HiResCAM (Draelos and Carin, 2020, arXiv 2011.08891) multiplies gradient and activation
-place by place. The third are integrated gradients of the pixels through the whole encoder. The answer is the
-probe's logit by way of one factor while the others are held. Grad-CAM averages the gradient over places: it
-can light up where the answer does not look, which HiResCAM cannot. Maps are 4 x 4 at the activations: a
-region, not an outline.
+Maps of the probe's logit by way of one factor, the others held: Grad-CAM (Selvaraju et al., ICCV 2017) at the
+encoder's last spatial convolution, the paper's choice; HiResCAM (Draelos and Carin, arXiv 2011.08891), which
+multiplies gradient and activation place by place; integrated gradients of the pixels. Grad-CAM averages the
+gradient over places, so it can light up where the answer does not look.
 
-Sanity check of maps: Adebayo et al., Sanity Checks for Saliency Maps, NeurIPS 2018. A map that stays the
-same when the encoder's weights are drawn anew shows the image, not the model: do not trust it. One that
-stays with shuffled labels shows the encoder's interest, whatever the question. ``another image`` measures
-how much of a map is the same for every image. The verdict goes by Spearman's rank correlation over the places
-of the map. SSIM is that of the maps at the image's size, each divided by its largest value.
+Sanity check of maps: Adebayo et al., NeurIPS 2018. A map that stays the same when the encoder's weights are
+drawn anew shows the image, not the model. One that stays with shuffled labels shows the encoder's interest,
+whatever the question. The verdict goes by Spearman's rank correlation over the places of the map. SSIM is
+that of the maps at the image's size, each divided by its largest value.
 """
 
 from collections.abc import Sequence
@@ -122,7 +118,7 @@ def saliency(
         if len(weight) != len(images):
             raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
     if method == "pixels":
-        return pixel_attribution(model, images, factor, weight)[0]
+        return pixel_attribution(model, images, factor, weight)
     features, gradient = _at_features(model, images, factor, weight)
     if method == "grad-cam":
         gradient = gradient.mean(dim=(2, 3), keepdim=True)
@@ -160,8 +156,8 @@ def _at_features(
 
 def pixel_attribution(
     model: Any, images: Float[Tensor, "n 3 h w"], factor: str, weight: Tensor | None
-) -> tuple[Float[Tensor, "n h w"], Float[Tensor, " n"]]:
-    """|IG| of the pixels from a grey image, summed over colours, and the relative completeness error."""
+) -> Float[Tensor, "n h w"]:
+    """|IG| of the pixels from a grey image, summed over colours."""
 
     def answer(pixels: Tensor, own: Tensor | None = None) -> Tensor:
         active = model.factor_activations(factor, pixels)
@@ -169,13 +165,11 @@ def pixel_attribution(
 
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():
-        attribution, delta = captum_attr().IntegratedGradients(answer).attribute(
-            images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS, return_convergence_delta=True,
+        found = captum_attr().IntegratedGradients(answer).attribute(
+            images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS,
             internal_batch_size=max(len(images), 64),
         )  # fmt: skip
-    attribution, delta = attribution.detach(), delta.detach()
-    change = (attribution.sum(dim=(1, 2, 3)) - delta).abs().max().clamp(min=1e-12)
-    return attribution.abs().sum(dim=1).to(images), (delta.abs() / change).to(images)
+    return found.detach().abs().sum(dim=1).to(images)
 
 
 def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size size"]:
@@ -185,17 +179,15 @@ def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size 
 
 def to_one(maps: Float[Tensor, "n y x"]) -> Float[Tensor, "n y x"]:
     """Each map divided by its own largest value; an empty map stays empty."""
-    top = maps.amax(dim=(1, 2), keepdim=True)
-    return torch.where(top > 0, maps / top.clamp(min=torch.finfo(maps.dtype).tiny), 0.0)
+    return maps / maps.amax(dim=(1, 2), keepdim=True).clamp(min=torch.finfo(maps.dtype).tiny)
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """Similarity of the maps of one method and factor before and after a change (of ``CHANGES``).
+    """Similarity of the maps of one method and factor before and after a change.
 
-    ``spearman`` is the mean rank correlation over images and seeds, -1..1, 1 for unchanged, and ``spread``
-    its deviation. ``ssim`` is at most 1. ``empty`` is the share of comparisons left out, a map being empty or
-    flat.
+    ``spearman`` is the mean rank correlation over images and seeds, 1 for unchanged, ``spread`` its
+    deviation. ``empty`` is the share of comparisons left out, a map being empty or flat.
     """
 
     method: str
@@ -210,18 +202,17 @@ class Similarity:
 def sanity_check(
     model: Any,
     probe: Probe,
-    shuffled: Probe | None,
+    shuffled: Probe,
     images: Tensor,
     targets: np.ndarray,
     *,
     methods: Sequence[str] = METHODS,
     seeds: Sequence[int] = (0, 1, 2),
 ) -> list[Similarity]:
-    """Compare the maps of a model with those of the same networks with fresh weights, and more.
+    """Compare the maps of a model with those of fresh weights (by seed), shuffled labels, another image.
 
-    ``probe`` is explained, the same when weights change; ``shuffled`` is one of shuffled labels, or None. Two
-    ``images`` or more are in 0..1, ``targets`` the label or class explained for each; ``seeds`` are of the
-    fresh weights.
+    ``probe`` is explained, ``shuffled`` learned shuffled labels. Two ``images`` or more are in 0..1,
+    ``targets`` the label or class explained for each.
     """
     if len(images) < 2:
         raise ValueError(f"a sanity check compares maps of 2 images or more, got {len(images)}")
@@ -233,14 +224,9 @@ def sanity_check(
                 return saliency(method, net, images, factor, asked, targets)
 
             own = maps(model, probe)
-            others = {
-                "random weights": [maps(twin, probe) for twin in twins],
-                "shuffled labels": [] if shuffled is None else [maps(model, shuffled)],
-                "another image": [own.roll(1, dims=0)],
-            }
-            for changed, them in others.items():
-                if them:
-                    found.append(similarity(method, factor, changed, own, them, images.shape[-1]))
+            fresh, learned = [maps(twin, probe) for twin in twins], maps(model, shuffled)
+            for changed, others in zip(CHANGES, (fresh, [learned], [own.roll(1, dims=0)]), strict=True):
+                found.append(similarity(method, factor, changed, own, others, images.shape[-1]))
     return found
 
 

@@ -191,34 +191,27 @@ def explain_labels(
     ((count, train),) = split.train.items()
     if len(train) != len(seeds):
         raise ValueError(f"{len(seeds)} seeds need as many choices of rows, got {len(train)}")
-    fitted: dict[str, list[Probe]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
-    measured: dict[str, list[tuple[np.ndarray, ...]]] = {name: [] for name in fitted}
+    runs: dict[str, list[tuple[Any, ...]]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
     total = 2 * len(seeds) + min(len(untrained), len(seeds))
     for place, (seed, rows) in enumerate(zip(seeds, train, strict=True)):
-        tried = [("model", features, task), ("shuffled labels", features, shuffled(task, rows, seed))]
+        mixed = task.targets.copy()
+        mixed[rows] = mixed[np.random.default_rng(seed).permutation(rows)]
+        tried = [("model", features, task), ("shuffled labels", features, replace(task, targets=mixed))]
         tried += [("untrained encoder", values, task) for values in untrained[place : place + 1]]
         for name, values, asked in tried:
             probe = fit_probe(values, asked, rows, head=head, seed=seed)
             start = None if baseline == "zero" else probe.columns(values)[rows].mean(axis=0)
             z, targets = probe.columns(values)[split.test], task.targets[split.test]
             parts = _shares(probe, z, targets, start, output)
-            fitted[name].append(probe)
-            measured[name].append((*parts, *scores(probe, z, targets, seed)))
+            runs[name].append((probe, *parts, *scores(probe, z, targets, seed)))
             if progress is not None:
-                progress(sum(map(len, measured.values())), total)
-    first = fitted["model"][0]
+                progress(sum(map(len, runs.values())), total)
+    first, shuffled = (runs[name][0][0] for name in ("model", "shuffled labels"))
+    shares = tuple(_row(name, [found for _, *found in own]) for name, own in runs.items() if own)
     return Explanation(
-        task.kind, task.names, first.factors,
-        tuple(_row(name, runs) for name, runs in measured.items() if runs), first,
-        fitted["shuffled labels"][0], count, len(split.test), head, output, baseline,
+        task.kind, task.names, first.factors, shares, first, shuffled, count, len(split.test), head, output,
+        baseline,
     )  # fmt: skip
-
-
-def shuffled(task: Task, rows: np.ndarray, seed: int) -> Task:
-    """The same task with the targets of ``rows`` shuffled among them."""
-    targets = task.targets.copy()
-    targets[rows] = targets[np.random.default_rng(seed).permutation(rows)]
-    return replace(task, targets=targets)
 
 
 def _shares(
@@ -260,7 +253,7 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
     return found
 
 
-def _row(name: str, runs: Sequence[tuple[np.ndarray, ...]]) -> ShareRow:
+def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> ShareRow:
     shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
     known = np.ma.masked_invalid(shares)
     per_seed, (low, high) = known.mean(axis=1).filled(np.nan), _interval(known.mean(axis=0))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from derender.evaluation.score_table import Cell, Column, Interval, Row, ScoreTable, interval_column
-from derender.interpretation.attribution import UNCHANGED, Similarity
+from derender.interpretation.attribution import CHANGES, UNCHANGED, Similarity
 from derender.interpretation.probe import Probe
 
 Features = Mapping[str, np.ndarray]
@@ -21,11 +21,10 @@ Features = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class ClusterShares:
-    """C clusters, of some sizes, each against all other rows, by F factors, (C, F) each.
+    """C clusters, of some sizes, each against all other rows, by F factors, (C, F) each, 0..1.
 
-    ``share`` is the part of the squared distance between the means of cluster and rest, 0..1, and sums to 1
-    over factors. ``ratio`` is the share of the factor's own variance that lies between cluster and rest (eta
-    squared), 0..1, whatever the factor's scale. ``chance`` is the mean ratio for rows shuffled.
+    ``share`` is the part of the squared distance between the means of cluster and rest. ``ratio`` is the
+    share of the factor's own variance that lies between them (eta squared), ``chance`` that of shuffled rows.
     """
 
     names: tuple[str, ...]
@@ -40,10 +39,9 @@ class ClusterShares:
 class PairParts:
     """Parts of the distance and the cosine of two images, (F,) by factor.
 
-    The squared ``distance`` and the ``cosine`` add up to those of the whole features, ``distance_share`` to 1
-    (0 for identical features). ``own_cosine`` is of each factor alone, -1..1, NaN where a feature is 0.
-    ``quantile`` is the share of all pairs of images that lie farther apart in this factor, near 1 where the
-    two are unusually alike.
+    The squared ``distance`` and the ``cosine`` add up to those of the whole features. ``own_cosine`` is of
+    each factor alone, NaN where a feature is 0. ``quantile`` is the share of all pairs of images that lie
+    farther apart in this factor.
     """
 
     factors: tuple[str, ...]
@@ -129,11 +127,10 @@ def _over(part: np.ndarray, whole: np.ndarray | float) -> np.ndarray:
 class ShareRow:
     """Shares of one set of features; S seeds, A labels or classes, F factors.
 
-    ``shares`` (S, A, F) are means over test images of the share of |IG|, 0..1, that sum to 1 over factors.
-    ``low`` and ``high`` (A, F) end the 95 % interval of their mean over seeds. ``auc`` (S, A) is the area
-    under the ROC curve on the test rows, 0.5 at chance, best 1. ``drop`` (S, A, F) is lost when this factor's
-    features are exchanged between images. ``error`` is the largest completeness error over the largest change
-    of an answer.
+    ``shares`` (S, A, F) are means over test images of the share of |IG|, with the 95 % interval ``low`` to
+    ``high`` (A, F). ``auc`` (S, A) is the area under the ROC curve, of which ``drop`` (S, A, F) is lost when
+    this factor's features are exchanged between images. ``error`` is the largest completeness error over the
+    largest change of an answer.
     """
 
     name: str
@@ -262,17 +259,15 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
         Column("empty", None, 2, "share of comparisons left out because a map was empty"),
         Column("changes", None, note="whether new weights change the map"),
     )
-    found = {(row.method, row.factor, row.changed): row for row in rows}
+    found: dict[str, dict[str, Similarity]] = {}
+    for row in rows:
+        found.setdefault(f"{row.method}, {row.factor}", {})[row.changed] = row
     lines = []
-    for method, factor in dict.fromkeys((row.method, row.factor) for row in rows):
-        fresh, labels, other = (
-            found.get((method, factor, changed))
-            for changed in ("random weights", "shuffled labels", "another image")
-        )
-        assert fresh is not None
-        word = "yes" if fresh.spearman < UNCHANGED else "no"
-        cells = (fresh.spearman, fresh.ssim, labels and labels.spearman, other and other.spearman)
-        lines.append(Row(f"{method}, {factor}", (*cells, fresh.empty, word if fresh.empty < 1 else "-")))
+    for name, by_change in found.items():
+        fresh, labels, other = (by_change[changed] for changed in CHANGES)
+        word = "-" if fresh.empty == 1 else "yes" if fresh.spearman < UNCHANGED else "no"
+        cells = (fresh.spearman, fresh.ssim, labels.spearman, other.spearman, fresh.empty, word)
+        lines.append(Row(name, cells))
     return ScoreTable("Do maps change with the learned weights? Similarity, -1 to 1", "map", columns, lines)
 
 
