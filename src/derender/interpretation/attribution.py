@@ -4,10 +4,10 @@ Shares: integrated gradients of a probe (Sundararajan et al., ICML 2017), comput
 share (Klinghoffer et al., ECCV 2022) is the sum of |IG| over its dimensions, over the sum of all. A zero
 baseline counts a feature that is large in every image; the mean as baseline does not.
 
-Maps of the probe's logit by way of one factor, the others held: Grad-CAM (Selvaraju et al., ICCV 2017) at the
-encoder's last spatial convolution, the paper's choice; HiResCAM (Draelos and Carin, arXiv 2011.08891), which
-multiplies gradient and activation place by place; integrated gradients of the pixels. Grad-CAM averages the
-gradient over places, so it can light up where the answer does not look.
+Maps explain the probe's logit by way of one factor, the others held. Grad-CAM (Selvaraju et al., ICCV 2017)
+at the encoder's last spatial convolution is the paper's choice. It averages the gradient over places, so it
+can light up where the answer does not look. HiResCAM (Draelos and Carin, arXiv 2011.08891) multiplies
+gradient and activation place by place. The third are integrated gradients of the pixels.
 
 Sanity check of maps: Adebayo et al., NeurIPS 2018. A map that stays the same when the encoder's weights are
 drawn anew shows the image, not the model. One that stays with shuffled labels shows the encoder's interest,

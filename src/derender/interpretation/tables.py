@@ -128,9 +128,8 @@ class ShareRow:
     """Shares of one set of features; S seeds, A labels or classes, F factors.
 
     ``shares`` (S, A, F) are means over test images of the share of |IG|, with the 95 % interval ``low`` to
-    ``high`` (A, F). ``auc`` (S, A) is the area under the ROC curve, of which ``drop`` (S, A, F) is lost when
-    this factor's features are exchanged between images. ``error`` is the largest completeness error over the
-    largest change of an answer.
+    ``high`` (A, F). ``auc`` (S, A) is the area under the ROC curve. Of that ``drop`` (S, A, F) is lost when
+    this factor's features are exchanged. ``error`` is the largest completeness error over the largest change.
     """
 
     name: str

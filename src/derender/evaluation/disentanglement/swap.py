@@ -8,10 +8,9 @@ donor p(i), a random derangement:
     moved[k, j]   = mean_i |swapped_k(i)_j - plain(i)_j|  /  mean_i |plain(i)_j - plain(p(i))_j|
 
 so 0 means that feature j stayed and 1 that it moved as far as two different images are apart. Best: the
-identity matrix. Both ends of a difference are renderings, so the loss of reconstruction does not count; it is
-reported by itself as ``unexchanged``. |.| is the Euclidean distance. The same is done with the decoded
-parameters and with the pixels. Pixels that no surface covers are filled as in training (training/step.py).
-Leaves out whether a swapped image looks right.
+identity matrix. Both ends of a difference are renderings; the loss of reconstruction is reported by itself as
+``unexchanged``. The same is done with the decoded parameters and with the pixels. Pixels that no surface
+covers are filled as in training (training/step.py).
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,9 +33,8 @@ from derender.training.step import fill_uncovered
 class SwapScores:
     """How far F features moved, in units of the mean distance of an image and its donor; NaN where that is 0.
 
-    ``moved`` and ``moved_parameters`` (of decoded depth, albedo, light and camera) are (F, F): row, the
-    factor exchanged, column, what moved; best 1 on the diagonal, 0 elsewhere. (F,) ``moved_pixels`` is the
-    image's own move. ``arrived`` is the remaining distance to the donor's feature, ``unexchanged`` the move
+    ``moved`` and ``moved_parameters`` (decoded) are (F, F): row, the factor exchanged, column, what moved;
+    best the identity. ``arrived`` is the remaining distance to the donor's feature, ``unexchanged`` the move
     from an image to its own rendering, both best 0. Each ``ratio`` is the mean of the diagonal over that of
     the rest, 1 where nothing is disentangled. ``resampled`` (B, 2) has both on resamples of the images.
     """
