@@ -57,8 +57,8 @@ def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> d
             error = weights @ np.abs(predicted - true - offset) / total
             return r, covariance / true_spread, error, weights @ (predicted - true) / total
 
-    once, drawn = scores(np.ones((1, len(true)))), scores(weights.astype(np.float64))
-    return {name: estimate(own, all_) for name, own, all_ in zip(AGREEMENT, once, drawn, strict=True)}
+    found = scores(np.concatenate((np.ones((1, len(true))), weights)))  # first every row once
+    return {name: estimate(own[:1], own[1:]) for name, own in zip(AGREEMENT, found, strict=True)}
 
 
 def agreement_table(

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_erosion, generate_binary_structure
 from torch import Tensor
 
 from derender.data import GroundTruth
@@ -70,13 +71,6 @@ class GeometryResult(ImageResult):
         return named if self.untrained is None else {**named, "untrained model": self.untrained}
 
 
-def erode(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """Take one pixel off: what stays is inside with its four neighbours; beyond the border is outside."""
-    padded = torch.nn.functional.pad(mask, (1, 1, 1, 1), value=False)
-    inner = padded[:, 1:-1, :-2] & padded[:, 1:-1, 2:] & padded[:, :-2, 1:-1] & padded[:, 2:, 1:-1]
-    return mask & inner
-
-
 def angle_deg(a: Float[Tensor, "*n 3"], b: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
     """Angle between vectors in degrees, exact also where it is small (arc cosine is not)."""
     return torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1)))
@@ -96,7 +90,9 @@ def geometry_scores(
     positive inside the object. ``fov_deg`` is horizontal; ``normal_true`` are true normals where they are
     known better than from depth: camera frame, inward.
     """
-    inside, valid = erode(mask_true), erode(mask_true & mask_pred)
+    cross = generate_binary_structure(2, 1)[None]  # a pixel stays if its four neighbours are inside
+    eroded = (binary_erosion(mask.cpu(), cross) for mask in (mask_true, mask_true & mask_pred))
+    inside, valid = (torch.from_numpy(mask).to(mask_true.device) for mask in eroded)
     if not inside.any():
         raise ValueError("the true masks are empty after taking one pixel off: nothing to compare")
     if not valid.any():

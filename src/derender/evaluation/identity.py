@@ -142,10 +142,10 @@ def _gallery(
         if not (known & wanted).any():
             raise ValueError(f"no image has {rule}: the gallery is empty")
         return known & wanted
-    chosen = np.zeros(len(who), bool)
-    for person in np.unique(who[known]):
-        own = np.flatnonzero(known & (who == person))
-        chosen[own[0 if angle is None else int(np.argmin(angle[own]))]] = True
+    rows, chosen = np.flatnonzero(known), np.zeros(len(who), bool)
+    if angle is not None:
+        rows = rows[np.argsort(angle[rows], kind="stable")]
+    chosen[rows[np.unique(who[rows], return_index=True)[1]]] = True
     return chosen
 
 

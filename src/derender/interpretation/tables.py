@@ -198,15 +198,12 @@ def share_table(found: Explanation) -> ScoreTable:
         columns += [column, interval_column(column, "images")]
     model = found.rows[0]
 
-    def one(answer: int) -> list[Cell]:
-        cells: list[Cell] = []
-        for place, share in enumerate(_means(model.shares[:, [answer]])):
-            cells += [share, Interval(float(model.low[answer, place]), float(model.high[answer, place]))]
-        return [*cells, *_means(model.auc[:, [answer], None])]
-
-    def whole(row: ShareRow) -> list[Cell]:
-        shares = [cell for share in _means(row.shares) for cell in (share, None)]
-        return [*shares, *_means(row.auc[..., None])]
+    def cells(row: ShareRow, answer: int | None) -> list[Cell]:
+        shown: list[Cell] = []
+        ends = np.stack((row.low, row.high), axis=-1).tolist()
+        for place, share in enumerate(_means(row.shares, answer)):
+            shown += [share, None if answer is None else Interval(*ends[answer][place])]
+        return [*shown, *_means(row.auc[..., None], answer)]
 
     what = "yes/no labels" if found.kind == "labels" else "classes, each on its own images"
     seeds = len(model.shares)
@@ -215,23 +212,22 @@ def share_table(found: Explanation) -> ScoreTable:
         f"{found.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(found.names)} {what}; "
         f"{found.output} from a {found.baseline} baseline, completeness error {model.error:.1e}"
     )
-    return _answers(found, caption, [*columns, AUC], one, whole)
+    return _answers(found, caption, [*columns, AUC], cells)
 
 
 def drop_table(found: Explanation) -> ScoreTable:
     """AUC lost when one factor's features are exchanged between the held-out images."""
     columns = [Column(factor, note="AUC lost without this factor") for factor in found.factors]
     caption = "AUC lost when one factor's features are exchanged between images: a check without gradients"
-    drop = found.rows[0].drop
-    return _answers(found, caption, columns, lambda at: _means(drop[:, [at]]), lambda row: _means(row.drop))
+    return _answers(found, caption, columns, lambda row, answer: _means(row.drop, answer))
 
 
-def _answers(found: Explanation, caption: str, columns: Sequence[Column], one: Any, whole: Any) -> ScoreTable:
-    """A row of ``one`` answer each, their mean first, the ``whole`` controls last."""
+def _answers(found: Explanation, caption: str, columns: Sequence[Column], cells: Any) -> ScoreTable:
+    """A row for each answer of the model, their mean (None) first, those of controls last."""
     model, *controls = found.rows
-    rows = [Row(f"mean of {len(found.names)}", whole(model))] if len(found.names) > 1 else []
-    rows += [Row(name, one(answer)) for answer, name in enumerate(found.names)]
-    rows += [Row(row.name, whole(row), True) for row in controls]
+    rows = [Row(f"mean of {len(found.names)}", cells(model, None))] if len(found.names) > 1 else []
+    rows += [Row(name, cells(model, answer)) for answer, name in enumerate(found.names)]
+    rows += [Row(row.name, cells(row, None), True) for row in controls]
     return ScoreTable(caption, "label" if found.kind == "labels" else "class", columns, rows)
 
 
@@ -309,6 +305,7 @@ def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
     return ScoreTable(caption, "factor", columns, (*rows, whole))
 
 
-def _means(values: np.ndarray) -> list[float | None]:
-    """(S, A, F) as the mean of what is finite for each factor."""
-    return np.ma.masked_invalid(values).mean(axis=(0, 1)).tolist()
+def _means(values: np.ndarray, answer: int | None) -> list[float | None]:
+    """(S, A, F) as the mean of what is finite for each factor, over one answer or all."""
+    own = values if answer is None else values[:, [answer]]
+    return np.ma.masked_invalid(own).mean(axis=(0, 1)).tolist()

@@ -310,28 +310,24 @@ def _scored(
     """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
     truths = [trial.task.targets[rows] for rows in curve.points]
     places = [np.searchsorted(tested, rows) for rows in curve.points]
-    once = [np.ones((1, len(rows)), np.float32) for rows in curve.points]
     units = [trial.unit[rows] for rows in curve.points]
     draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
     seeds = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
-    weights = [group_resamples(own, count, one) for own, one in zip(units, seeds, strict=True)]
+    drawn = [group_resamples(own, count, one) for own, one in zip(units, seeds, strict=True)]
+    weights = [np.concatenate((np.ones_like(own[:1]), own)) for own in drawn]  # first every row once
     names = (ORDINARY, AREA, *map(level_name, curve.levels))
 
-    def scores(run: np.ndarray, drawn: Sequence[np.ndarray]) -> np.ndarray:
-        """(B, points, 2) both scores, given how often each row of a point is drawn, (B, T) each."""
-        asked = zip(truths, places, drawn, strict=True)
-        return np.stack(
-            [count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked], axis=1
-        )
-
-    def with_area(points: np.ndarray) -> np.ndarray:
-        return np.column_stack((points[:, :1], area_under(curve.levels, points[:, 1:]), points[:, 1:]))
+    def scores(run: np.ndarray) -> np.ndarray:
+        """(1 + B, 1 + points, 2) both scores, the area second."""
+        asked = zip(truths, places, weights, strict=True)
+        ordinary, *levels = (count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked)
+        area = area_under(curve.levels, np.stack(levels, axis=-1))
+        return np.stack((ordinary, area, *levels), axis=1)
 
     found: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
     for name, runs in answers.items():
-        plain = np.concatenate([scores(run, once) for run in runs])
-        resampled = np.mean([scores(run, weights) for run in runs], axis=0)
+        both = np.stack([scores(run) for run in runs])
+        plain, resampled = both[:, 0], both[:, 1:].mean(axis=0)
         for at, rows in enumerate(found.values()):
-            both = with_area(plain[:, :, at]), with_area(resampled[:, :, at])
-            rows.append(scored_row(name, name in controls, names, *both))
+            rows.append(scored_row(name, name in controls, names, plain[..., at], resampled[..., at]))
     return {score: with_verdicts(rows) for score, rows in found.items()}

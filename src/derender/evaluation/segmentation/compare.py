@@ -195,14 +195,14 @@ def segment(
         losses = nets.train_segmenter(net, data, seed, settings, step)
         return {**counted(nets.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
-    weights = np.concatenate(list(resamples(len(data.test), resample_count)))
+    drawn = np.concatenate(list(resamples(len(data.test), resample_count)))
+    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every image once
 
     def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
-        plain = np.concatenate([resampled_scores(run["counts"], np.ones_like(weights[:1])) for run in runs])
-        drawn = np.mean([resampled_scores(run["counts"], weights) for run in runs], axis=0)
+        found = np.stack([resampled_scores(run["counts"], weights) for run in runs])
         iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
         losses = np.array([run["losses"] for run in runs if trainable])
-        scored = scored_row(title, control, tuple(COLUMNS), plain, drawn)
+        scored = scored_row(title, control, tuple(COLUMNS), found[:, 0], found[:, 1:].mean(axis=0))
         return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
     rows = []
