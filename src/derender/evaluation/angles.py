@@ -1,9 +1,8 @@
 """Angles that a model predicts against known ones: of the head (``pose``) and of the light (``light``).
 
-Known angles are labels of the images (rendered sets, Extended Yale B) or a table, such as another judge's.
-Correlation and slope ask whether angles move together; the error, after the mean difference is subtracted,
-how far they are apart: which way an average face looks is a convention. Beside the model stand the best
-constant answer and the same networks untrained. Leaves out translations.
+Known angles are labels of the images or a table, such as another judge's. Correlation and slope ask whether
+angles move together. The error is what remains after the mean difference: which way an average face looks is
+a convention. Beside the model stand the best constant answer and the same networks untrained.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,10 +1,9 @@
 """Is albedo as bright as the surface is, or does a dark surface pass for dim light? Is relighting true?
 
 On rendered images with true albedo: mean brightness (luma, 0..1) of predicted albedo over the object against
-the true one, and distance of their mean colours. The predicted light should not know the true brightness;
-whether it does is a score. Photographs have no true albedo, but groups of people (as race of UTKFace) differ
-in the brightness of their images. Albedo takes a share of that difference: 1 where light is the same for all
-groups, 0 where the model explains skin by light. Values are stored (sRGB) ones, as in training.
+the true one, and distance of their mean colours. The predicted light should not know the true brightness.
+Photographs have no true albedo, but groups of people differ in the brightness of their images. Albedo takes a
+share of that difference: 1 where light is the same for all groups, 0 where the model explains skin by light.
 
 Relighting against photographs of known light, such as the cropped Extended Yale B. Each person's most frontal
 image takes the light that a model predicts for the next person's image in a light. The result is compared
@@ -170,7 +169,6 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a - b, axis=1)
 
 
-PHOTO_SIZE = 128
 BORDER = {"yaleb": (15 / 128, 21 / 128)}
 """By layout, shares of rows and columns at each side that are no part of the photograph, but its edge."""
 NEEDED = ("identity", "light_azimuth_deg", "light_elevation_deg", "light_deg")
@@ -181,7 +179,7 @@ def relight(
     model: Derenderer | str | Path,
     images: ImageSet | str | Path,
     *,
-    size: int = PHOTO_SIZE,
+    size: int = 128,
     fit_steps: int | None = None,
     **options: Any,
 ) -> Scores:

@@ -1,9 +1,8 @@
 """Which factor answers a question: shares over seeds and images, beside probes that learned nothing.
 
 Every seed chooses training rows and fits a probe; shares and scores are of the test rows, which no seed
-learns from. Controls under the same protocol: the same features with shuffled labels in the training rows,
-and an untrained encoder. ``drop`` is a second opinion without gradients: how much AUC is lost when one
-factor's features are exchanged between test images. Leaves out maps over the image (attribution.py).
+learns from. Controls: the same features with shuffled labels in the training rows, and an untrained encoder.
+``drop`` is a second opinion without gradients: the AUC lost when one factor's features are exchanged.
 """
 
 from collections.abc import Callable, Mapping, Sequence

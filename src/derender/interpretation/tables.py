@@ -1,9 +1,7 @@
 """Shares of factors as values and tables: answers by factor, AUC lost without one, maps checked, groups.
 
-Features of factors stand side by side. Their squared distance is the sum of the squared distances of each
-factor, their cosine the sum of each factor's part of the inner product: parts of clusters and pairs need no
-probe, and nothing is approximated. They depend on the features' scale, as the clustering itself does;
-``ratio`` does not.
+Squared distances of features side by side are sums over factors, and so are cosines: parts of clusters and
+pairs need no probe and are exact. They depend on the features' scale; ``ratio`` does not.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,16 +1,14 @@
 """Where the images of a trial come from: a generator, a model that re-renders, or labels of the true angles.
 
-generated  Light and view are known because they were set. Face, expression and background depend on seed
-           and index alone: only the angle changes along a curve. Each image is shown from both sides. Probes
-           learn in the generator's usual light and view. For identity other images of the same people are
-           tested, for any other label other people.
-rendered   Real images are decomposed and re-rendered by a model. Training images are renderings too (each
-           scene in its own light and view), so that no curve starts with the step from photograph to
-           rendering. Angles are the model's own, and its features have an advantage: read it beside
-           generated images. Pixels that no surface covers take the mean colour of the image's edge.
+generated  Light and view were set; all else depends on seed and index alone. Each image is shown from both
+           sides. Probes learn in the generator's usual light and view. For identity other images of the same
+           people are tested, for any other label other people.
+rendered   Real images are decomposed and re-rendered by a model. Training images are renderings too, each in
+           its own light and view. Angles are the model's own, and its features have an advantage: read it
+           beside generated images.
 true       The unit is the track where there are tracks, else the image. Of every class, the less rotated
            half of its units is ordinary: three of four learn, the fourth is tested as the curve's first
-           point. The other half is tested in portions, by growing angle. Each angle shows other images.
+           point. The other half is tested in portions, by growing angle.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,8 +27,6 @@ from derender.evaluation.robust.trial import Axis, Curve, Trial, all_angles, sta
 from derender.features import Progress, map_batches, missing, model_fingerprint, named
 from derender.settings import Settings
 from derender.training.step import fill_uncovered
-
-PORTIONS = 3
 
 
 @dataclass(frozen=True)
@@ -76,9 +72,9 @@ class Recipe:
     def generate(
         self, part: str, count: int | None = None, axis: Axis | None = None, angle: float = 0.0
     ) -> SyntheticSet:
-        """The images of ``part`` "learned" or "tested" (``count`` of them), in usual light and view or at
-        a fixed angle in degrees. Both parts count people so that numbers agree; indices of images never
-        do, so no seed is shared.
+        """Images of ``part`` "learned" or "tested", in usual light and view or at a fixed angle in degrees.
+
+        Both parts count people so that numbers agree; indices of images never do, so no seed is shared.
         """
         kind, each = KINDS[self.kind], getattr(self, part)
         start = -(-self.people * self.learned // self.tested)  # people before the first one tested
@@ -192,9 +188,7 @@ def rendered_trial(
     return stacked_trial(images, task.select(rows), number[rows], len(learn), axes, levels, how, dropped)
 
 
-def true_angle_trial(
-    pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = PORTIONS
-) -> Trial:
+def true_angle_trial(pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = 3) -> Trial:
     """Divide images along every axis by their true angles, the more rotated half into portions."""
     tracks = pictures.labels.get("track", np.arange(len(pictures)))
     unit = np.unique(tracks, return_inverse=True)[1].astype(np.int64)

@@ -26,10 +26,9 @@ class Axis:
     """One way to turn light or camera.
 
     ``part`` is that of a generator's settings, "view" or "light"; ``settings`` has, by kind of generated
-    image, the name of the angle's range (degrees) there. ``column`` is that of a scene's camera or light.
-    ``truth`` are the labels (radians) of the angle; two mean the angle of a light's direction off the front.
-    Where the angle is to be the whole angle, the column ``cleared`` of a scene and the setting ``held`` of
-    generated images are 0.
+    image, the name of the angle's range there. ``column`` is that of a scene's camera or light. ``truth`` are
+    the labels (radians) of the angle; two mean a light's direction. The column ``cleared`` of a scene and the
+    setting ``held`` of generated images are set to 0.
     """
 
     name: str

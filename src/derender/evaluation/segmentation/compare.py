@@ -1,13 +1,11 @@
 """Face segmentation from pre-trained U-Net encoders: networks and controls on the same images, over seeds.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3. A seed changes fresh weights (the decoder's
-always) and the order of images, not the split. Runs are cached by the content of their inputs, so that an
-interrupted comparison continues with the next run.
+always) and the order of images, not the split. Each run is cached.
 
 Scores: mean intersection over union, that of the ten best classes, and pixel accuracy. Pixels are counted
-image by image and added up before they are divided, so that the same counts give the scores and their
-resamples. A class that no tested mask shows has no IoU and is left out of every mean, for every answer alike:
-answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
+image by image and added up before they are divided. A class that no tested mask shows is left out of every
+mean; answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,10 +46,8 @@ Progress = Callable[[int, int, str], object]
 class SegmentationRow:
     """One network or control.
 
-    ``scored`` holds ``COLUMNS`` with intervals and differences to the strongest control. ``class_iou`` is
-    (C,), a mean over runs, NaN for classes that no tested mask shows. ``trainable`` counts weights;
-    ``losses`` are (R, epochs), the mean of each epoch. ``shown`` are the first run's (K, S, S) answers for
-    the comparison's ``shown`` images.
+    ``class_iou`` is (C,), a mean over runs, NaN for classes that no tested mask shows. ``trainable`` counts
+    weights; ``losses`` are (R, epochs). ``shown`` are the first run's answers for the comparison's images.
     """
 
     scored: ScoredRow
@@ -252,7 +248,7 @@ def class_iou(counts: np.ndarray) -> np.ndarray:
 def resampled_scores(counts: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The scores of ``COLUMNS``, (B, 3), of (N, 3, C) counts; ``weights`` (B, N) say how often each is drawn.
 
-    The ten best classes are those of all images, on every resample.
+    The ten best classes are those of all images.
     """
     drawn = (weights.astype(np.float64) @ counts.reshape(len(counts), -1)).reshape(-1, *counts.shape[1:])
     iou = _iou(drawn)

@@ -1,12 +1,11 @@
 """The networks that are compared, how they are trained, and their answers.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs.
-Neither the loss nor the batch size is stated: cross-entropy, every pixel alike, and 64, or fewer where there
-are few images. The paper's only control is one encoder from fresh weights, while its best row joins two; this
-table adds two fresh encoders, trained and frozen. A pre-trained encoder keeps its BatchNorm statistics while
-its weights learn, since small batches have unreliable ones. A fresh encoder that is frozen gets those of the
-training images. The paper's decoder is always fresh; one network begins with the decoder that was distilled
-beside the encoders. Leaves out augmentation, class weights and early stopping: the last weights are scored.
+Neither the loss nor the batch size is stated: cross-entropy, and 64, or fewer of few images. To the paper's
+control, one encoder from fresh weights, this table adds two fresh encoders, trained and frozen. A pre-trained
+encoder keeps its BatchNorm statistics while its weights learn; a fresh one that is frozen gets those of the
+training images. One network begins with the decoder that was distilled beside the encoders. Leaves out
+augmentation, class weights and early stopping.
 """
 
 import copy
@@ -106,9 +105,8 @@ def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str,
 class SegmentationNet(nn.Module):
     """Images in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
 
-    ``frozen`` encoders never change. With ``kept_statistics`` their BatchNorm keeps its statistics in
-    training, too. Beside a learnt ``decoder``, of which all but the last layer is taken, only the two finest
-    levels of either do.
+    ``frozen`` encoders never change. With ``kept_statistics`` their BatchNorm keeps its statistics. Beside a
+    learnt ``decoder``, of which all but the last layer is taken, only the two finest levels of either do.
     """
 
     def __init__(
