@@ -17,6 +17,7 @@ from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet
+from derender.data.layouts import rendered
 from derender.data.layouts.layout import base_name
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples, numbers_of
 from derender.evaluation.depth import angle_deg
@@ -39,7 +40,6 @@ AGREEMENT = {
 }
 POSE = {"yaw": "camera_y_rad", "pitch": "camera_x_rad", "roll": "camera_z_rad"}
 LIGHT = {"azimuth": "light_azimuth_deg", "elevation": "light_elevation_deg"}
-_RENDERED_LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 
 
 def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> dict[str, Estimate]:
@@ -181,11 +181,13 @@ def known_angles(
     elif set(labels.values()) <= set(images.labels):
         true = np.stack([images.labels[name].astype(np.float64) for name in labels.values()], axis=1)
         true = np.degrees(true) if next(iter(labels.values())).endswith("_rad") else true
-    elif labels is LIGHT and {*_RENDERED_LIGHT, *POSE.values()} <= set(images.labels):
-        given = np.stack([images.labels[name] for name in _RENDERED_LIGHT], axis=1)
-        turned = np.stack([images.labels[f"camera_{axis}_rad"] for axis in "xyz"], axis=1)
-        camera = torch.from_numpy(np.concatenate((turned, np.zeros_like(turned)), axis=1).astype(np.float32))
-        true = _spherical(light_in_camera(torch.from_numpy(given.astype(np.float32)), camera)).numpy()
+    elif labels is LIGHT and {*rendered.LIGHT, *POSE.values()} <= set(images.labels):
+        given, turned = (
+            torch.from_numpy(np.stack([images.labels[name] for name in names], axis=1).astype(np.float32))
+            for names in (rendered.LIGHT, rendered.CAMERA[:3])
+        )
+        camera = torch.cat((turned, torch.zeros_like(turned)), dim=1)
+        true = _spherical(light_in_camera(given, camera)).numpy()
     else:
         have = ", ".join(images.labels) or "none"
         raise ValueError(
