@@ -113,12 +113,6 @@ def test_broken_pairs_are_named(tmp_path, text, message):
         read_pairs(tmp_path / "pairs.txt")
 
 
-def test_images_of_pairs_that_are_not_there(tmp_path, codes):
-    few = table(codes).select(slice(0, 90))
-    with pytest.raises(ValueError, match=r"images of the pairs are not there \(first P10_0001\)"):
-        verify(few, written(tmp_path / "pairs.txt"), factors=("code",))
-
-
 def test_the_area_is_that_of_scikit_learn_also_with_ties_and_weights():
     score, positive = RNG.integers(0, 12, 200).astype(float), RNG.random(200) < 0.4
     weights = RNG.integers(0, 4, (3, 200))

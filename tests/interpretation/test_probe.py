@@ -79,14 +79,10 @@ def test_numbers_are_cut_into_equal_bins():
 
 def test_bad_questions(labels):
     assert question(labels, ["age"]).names[0].startswith("1: ")
-    with pytest.raises(ValueError, match="no label 'smilin'; did you mean 'smiling'"):
-        question(labels, ["smilin"])
     with pytest.raises(ValueError, match=r"has same one, so there is nothing to distinguish.*ing, size, age"):
         question(labels, ["same"])
     with pytest.raises(ValueError, match="known for 5 images, and an explanation needs 20"):
         question(labels, ["few"])
-    with pytest.raises(ValueError, match="has no labels"):
-        question({}, ["smiling"])
     with pytest.raises(ValueError, match="2 bins or more"):
         question(labels, ["age"], bins=1)
 

@@ -30,7 +30,7 @@ def weight() -> np.ndarray:
 def test_attributions_sum_to_the_change_of_the_answer(z, weight, kind, output):
     probe = probe_of(weight, kind=kind)
     start = np.full(12, 0.1)
-    found, error = integrated_gradients(probe, z, 1, baseline=start, output=output, steps=64)
+    found, error = integrated_gradients(probe, z, 1, baseline=start, output=output)
 
     def answer(values):
         logits = values @ weight.T.astype(np.float64) + probe.bias

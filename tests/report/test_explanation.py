@@ -1,5 +1,6 @@
 """Overlays and tables of an explanation."""
 
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from PIL import Image
 
 from derender.interpretation.attribution import Similarity
-from derender.interpretation.tables import sanity_table, unasked, untrusted
+from derender.interpretation.tables import sanity_table, unchanged
 from derender.report.charts import side_by_side
 from derender.report.explanation import overlays
 
@@ -30,10 +31,12 @@ def test_the_sanity_table_names_what_not_to_trust():
         Similarity("grad-cam", "camera", "random weights", 0.1, 0.1, 0.1, 0.5),
         Similarity("grad-cam", "camera", "shuffled labels", 0.7, 0.1, 0.1, 0.5),
     ]
-    assert untrusted(rows) == ["pixels, light"] and unasked(rows) == ["grad-cam, camera"]
+    rows += [replace(row, changed="another image") for row in rows[::2]]
+    assert unchanged(rows, "random weights") == ["pixels, light"]
+    assert unchanged(rows, "shuffled labels") == ["grad-cam, camera"]
     values = sanity_table(rows).values()
     assert values["pixels, light"]["changes"] == "no" and values["grad-cam, camera"]["changes"] == "yes"
-    assert values["pixels, light"]["other image"] is None
+    assert values["pixels, light"]["other image"] == 0.9
 
 
 def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():

@@ -1,9 +1,8 @@
 """Angles that a model predicts against known ones: of the head (``pose``) and of the light (``light``).
 
-Known angles are labels of the images (rendered sets, Extended Yale B) or a table, such as another judge's.
-Correlation and slope ask whether angles move together; the error, after the mean difference is subtracted,
-how far they are apart: which way an average face looks is a convention. Beside the model stand the best
-constant answer and the same networks untrained. Leaves out translations.
+Known angles are labels of the images or a table, such as another judge's. Correlation and slope ask whether
+angles move together. The error is what remains after the mean difference: which way an average face looks is
+a convention. Beside the model stand the best constant answer and the same networks untrained.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet
+from derender.data.layouts import rendered
 from derender.data.layouts.layout import base_name
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples, numbers_of
 from derender.evaluation.depth import angle_deg
@@ -30,7 +30,6 @@ from derender.features import map_batches
 from derender.features.table import named
 from derender.inputs import as_model
 from derender.model import Derenderer
-from derender.scene import Scene
 from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, require_regular
 
 AGREEMENT = {
@@ -41,7 +40,6 @@ AGREEMENT = {
 }
 POSE = {"yaw": "camera_y_rad", "pitch": "camera_x_rad", "roll": "camera_z_rad"}
 LIGHT = {"azimuth": "light_azimuth_deg", "elevation": "light_elevation_deg"}
-_RENDERED_LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 
 
 def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> dict[str, Estimate]:
@@ -58,8 +56,8 @@ def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> d
             error = weights @ np.abs(predicted - true - offset) / total
             return r, covariance / true_spread, error, weights @ (predicted - true) / total
 
-    once, drawn = scores(np.ones((1, len(true)))), scores(weights.astype(np.float64))
-    return {name: estimate(own, all_) for name, own, all_ in zip(AGREEMENT, once, drawn, strict=True)}
+    found = scores(np.concatenate((np.ones((1, len(true))), weights)))  # first every row once
+    return {name: estimate(own[:1], own[1:]) for name, own in zip(AGREEMENT, found, strict=True)}
 
 
 def agreement_table(
@@ -97,11 +95,7 @@ def pose(
     Raises:
         ValueError: neither labels nor a table hold the angles, or the table names none of the images.
     """
-
-    def predicted(scene: Scene) -> Tensor:
-        return torch.rad2deg(scene.camera[:, [1, 0, 2]])
-
-    return _angles("Pose", model, images, table, POSE, predicted, fit_steps, options)
+    return _angles("Pose", model, images, table, fit_steps, options)
 
 
 def light(
@@ -118,29 +112,29 @@ def light(
     the angle between both directions, by the angle between light and view. Arguments are those of ``pose``;
     a table has the columns ``azimuth`` and ``elevation``.
     """
-
-    def predicted(scene: Scene) -> Tensor:
-        return _spherical(light_in_camera(scene.light, scene.camera))
-
-    return _angles("Light", model, images, table, LIGHT, predicted, fit_steps, options)
+    return _angles("Light", model, images, table, fit_steps, options)
 
 
 def _angles(
-    what: str, model: Any, images: Any, table: Any, labels: Mapping[str, str], predicted: Any,
-    fit_steps: int | None, options: Mapping[str, Any],
-) -> Scores:  # fmt: skip
+    what: str, model: Any, images: Any, table: Any, fit_steps: int | None, options: Mapping[str, Any]
+) -> Scores:
+    labels = POSE if what == "Pose" else LIGHT
     how = Options(images=images, **{"keep_duplicates": True, **options})
     model = as_model(model, device=how.device)
     true, read = known_angles(how.at(model.image_size), table, labels)
     nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
 
-    def seen(net: Any, name: str) -> np.ndarray:
-        def see(batch: Tensor) -> np.ndarray:
-            return predicted(net.decompose(batch)).double().numpy(force=True)
+    found = {}
+    for name, net in nets.items():
 
-        return np.concatenate(map_batches(see, net, read.images, batch_size=64, progress=how.stage(name)))
+        def see(batch: Tensor, net: Any = net) -> np.ndarray:
+            scene = net.decompose(batch)
+            pose = torch.rad2deg(scene.camera[:, [1, 0, 2]])
+            angles = pose if what == "Pose" else _spherical(light_in_camera(scene.light, scene.camera))
+            return angles.double().numpy(force=True)
 
-    found = {name: seen(net, name) for name, net in nets.items()}
+        parts = map_batches(see, net, read.images, batch_size=64, progress=how.stage(name))
+        found[name] = np.concatenate(parts)
     people = read.labels.get("identity", np.array(read.files))
     weights = group_resamples(people.astype(str), how.resamples, how.seed)
     tables: list[ScoreTable] = []
@@ -151,26 +145,25 @@ def _angles(
         shown, values[name] = agreement_table(caption, answers, true[:, column], weights)
         tables.append(shown)
     if what == "Light":
-        extra, values["direction"] = _directions(found, true, people.astype(str), how)
-        tables.append(extra)
+        rows, columns = _directions(found, true, people.astype(str), how)
+        caption = "Light: degrees between true and predicted direction, by the angle between light and view"
+        tables.append(scored_table(caption, "prediction", rows, columns, deviations=()))
+        values["direction"] = numbers_of(rows)
     return Scores(tables, values, how.notes)
 
 
 def _directions(
     found: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
-) -> tuple[ScoreTable, dict[str, Any]]:
+) -> tuple[Sequence[ScoredRow], Mapping[str, Column]]:
     """Angle between true and predicted direction, all and by the angle between light and view."""
     aim = _unit(true)
     answers = {name: _unit(angles) for name, angles in found.items()}
     answers["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
     off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
     apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in answers.items()}
-    rows, columns, _ = binned_rows(
+    return binned_rows(
         apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
-    )
-    caption = "Light: degrees between true and predicted direction, by the angle between light and view"
-    numbers = numbers_of(rows)
-    return scored_table(caption, "prediction", rows, columns, deviations=()), numbers
+    )[:2]
 
 
 def known_angles(
@@ -188,11 +181,13 @@ def known_angles(
     elif set(labels.values()) <= set(images.labels):
         true = np.stack([images.labels[name].astype(np.float64) for name in labels.values()], axis=1)
         true = np.degrees(true) if next(iter(labels.values())).endswith("_rad") else true
-    elif labels is LIGHT and {*_RENDERED_LIGHT, *POSE.values()} <= set(images.labels):
-        given = np.stack([images.labels[name] for name in _RENDERED_LIGHT], axis=1)
-        turned = np.stack([images.labels[f"camera_{axis}_rad"] for axis in "xyz"], axis=1)
-        camera = torch.from_numpy(np.concatenate((turned, np.zeros_like(turned)), axis=1).astype(np.float32))
-        true = _spherical(light_in_camera(torch.from_numpy(given.astype(np.float32)), camera)).numpy()
+    elif labels is LIGHT and {*rendered.LIGHT, *POSE.values()} <= set(images.labels):
+        given, turned = (
+            torch.from_numpy(np.stack([images.labels[name] for name in names], axis=1).astype(np.float32))
+            for names in (rendered.LIGHT, rendered.CAMERA[:3])
+        )
+        camera = torch.cat((turned, torch.zeros_like(turned)), dim=1)
+        true = _spherical(light_in_camera(given, camera)).numpy()
     else:
         have = ", ".join(images.labels) or "none"
         raise ValueError(

@@ -1,18 +1,15 @@
 """Is albedo as bright as the surface is, or does a dark surface pass for dim light? Is relighting true?
 
 On rendered images with true albedo: mean brightness (luma, 0..1) of predicted albedo over the object against
-the true one, and distance of their mean colours. The predicted light should not know the true brightness;
-whether it does is a score. Photographs have no true albedo, but groups of people (as race of UTKFace) differ
-in the brightness of their images. Albedo takes a share of that difference: 1 where light is the same for all
-groups, 0 where the model explains skin by light. Values are stored (sRGB) ones, as in training.
+the true one, and distance of their mean colours. The predicted light should not know the true brightness.
+Photographs have no true albedo, but groups of people differ in the brightness of their images. Albedo takes a
+share of that difference: 1 where light is the same for all groups, 0 where the model explains skin by light.
 
-Relighting against photographs: one image of a person in the light of another person's image.
-
-Images have known light, such as the cropped Extended Yale B. Each person's most frontal image takes the light
-that a model predicts for the next person's image in a light. The result is compared with the person's own
-image in that light, where the model draws a surface. Controls know the same two people: the image as it is,
-the mean image of all others in that light, and the image times the ratio of the other person's two. Leaves
-out cast shadows.
+Relighting against photographs of known light, such as the cropped Extended Yale B. Each person's most frontal
+image takes the light that a model predicts for the next person's image in a light. The result is compared
+with the person's own image in that light, where the model draws a surface. Controls know the same two people:
+the image as it is, the mean image of all others in that light, and the image times the ratio of the other
+person's two. Leaves out cast shadows.
 """
 
 from collections.abc import Mapping
@@ -172,7 +169,6 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a - b, axis=1)
 
 
-PHOTO_SIZE = 128
 BORDER = {"yaleb": (15 / 128, 21 / 128)}
 """By layout, shares of rows and columns at each side that are no part of the photograph, but its edge."""
 NEEDED = ("identity", "light_azimuth_deg", "light_elevation_deg", "light_deg")
@@ -183,7 +179,7 @@ def relight(
     model: Derenderer | str | Path,
     images: ImageSet | str | Path,
     *,
-    size: int = PHOTO_SIZE,
+    size: int = 128,
     fit_steps: int | None = None,
     **options: Any,
 ) -> Scores:
@@ -223,23 +219,24 @@ def relight(
         if not targets:
             continue
         rows += targets
-        shown = [place[others[0], lit[row]] for row in targets]
+        lent = [place[others[0], lit[row]] for row in targets]
         alike = [[place[one, lit[row]] for one in others if (one, lit[row]) in place] for row in targets]
-        ratio = photos[shown].clamp(min=0.02) / photos[place[others[0], lit[source]]].clamp(min=0.02)
+        ratio = photos[lent].clamp(min=0.02) / photos[place[others[0], lit[source]]].clamp(min=0.02)
         with torch.inference_mode():
-            target = scenes[[source] * len(shown)].with_parameters(light=scenes.light[shown])
+            target = scenes[[source] * len(lent)].with_parameters(light=scenes.light[lent])
             edited = PhotoDetail(photos[source], scenes[source], model.fov_deg)(target)
             rendered = model.render(at_size(target, photos.shape[-1]))
             mask = _mask(model, scenes[source], photos.shape[-1], read.layout)
-        found = {"photograph relit": edited, "model's rendering": rendered}
-        found = {name: drawn.image.clamp(0, 1).cpu() for name, drawn in found.items()}
         answers = (
+            edited.image,
+            rendered.image,
             photos[source].expand_as(ratio),
             torch.stack([photos[near].mean(dim=0) for near in alike]),
-            (photos[source] * ratio.clamp(0.05, 20)).clamp(0, 1),
+            photos[source] * ratio.clamp(0.05, 20),
         )
-        for name, drawn in {**found, **dict(zip(CONTROLS, answers, strict=True))}.items():
-            scores = reconstruction_scores(drawn.float(), photos[targets], mask.expand(len(targets), -1, -1))
+        for name, drawn in zip(("photograph relit", "model's rendering", *CONTROLS), answers, strict=True):
+            shown, covered = drawn.float().cpu().clamp(0, 1), mask.expand(len(targets), -1, -1)
+            scores = reconstruction_scores(shown, photos[targets], covered)
             apart["PSNR"].setdefault(name, []).append(scores.psnr_db_each)
             apart["SSIM"].setdefault(name, []).append(scores.ssim_each)
         if progress is not None:

@@ -28,9 +28,8 @@ from derender.inputs import as_images, as_model
 from derender.model import Derenderer
 
 COMPONENT_IMAGES = 2_000
-_KINDS: Mapping[str, type[ImageResult]] = {
-    "geometry": GeometryResult, "factors": FactorResult, "reconstruction": ReconstructionResult,
-}  # fmt: skip
+Protocols = dict[str, tuple[type[ImageResult], Callable[[], Any]]]
+"""By name the class of the result, and a call that makes it."""
 
 
 def geometry(
@@ -66,13 +65,14 @@ def geometry(
     scored = optimised(model, fit_steps)
     how: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, seed)}
     again = partial(evaluate_reconstruction, scored, exact.images, components_of=exact.images, **how)
-    protocols: dict[str, Callable[[], Any]] = {
-        "geometry": partial(evaluate_geometry, scored, exact, progress=progress, **how)
+    protocols: Protocols = {
+        "geometry": (GeometryResult, partial(evaluate_geometry, scored, exact, progress=progress, **how))
     }
     if {"albedo", "light", "camera"} <= set(known):
-        protocols["factors"] = partial(evaluate_factors, scored, exact, **how)
+        protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **how)
+    protocols["reconstruction"] = ReconstructionResult, again
     inputs = {**known, "seed": seed, "fitted": fit_steps or 0}
-    found = _scored(model, {**protocols, "reconstruction": again}, inputs, resample_count, memory)
+    found = _scored(model, protocols, inputs, resample_count, memory)
     if isinstance(factors := found.values.get("factors"), FactorResult):
         parts = {"factors": replace(factors, untrained=None), "factors_untrained": factors.untrained}
         found = replace(found, values={**found.values, **parts})
@@ -113,21 +113,21 @@ def reconstruction(
         )  # fmt: skip
 
     inputs = {"images": images.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0}
-    found = _scored(model, {"reconstruction": make}, inputs, resample_count, memory)
+    found = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, resample_count, memory)
     return replace(found, values={**found.values, "intervals": found.values["intervals"]["reconstruction"]})
 
 
 def _scored(
     model: Derenderer,
-    protocols: Mapping[str, Callable[[], Any]],
+    protocols: Protocols,
     inputs: Mapping[str, Any],
     resample_count: int,
     memory: Memory | None,
 ) -> Scores:
-    """What the protocols give by name, from the cache if the same model and inputs gave it before."""
+    """Results of protocols, from the cache if the same model and inputs gave them before."""
     settings, kept = model.settings.model_dump(mode="json"), memory or Memory()
     inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
-    found = {name: kept.recall_value(name, inputs, _KINDS[name], make) for name, make in protocols.items()}
+    found = {name: kept.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
     rows = {name: one.rows(resample_count) for name, one in found.items()}
     notes = [note for name, one in found.items() for note in image_verdicts(rows[name][0], one.columns)]
     intervals = {name: numbers_of(scored) for name, scored in rows.items()}

@@ -1,22 +1,18 @@
 """Attribution: each factor's share of an answer, and where in the image its encoder saw it.
 
 Shares: integrated gradients of a probe (Sundararajan et al., ICML 2017), computed by captum. A factor's
-share is that of Klinghoffer et al. (ECCV 2022, caption of the Grad-CAM figure): the sum of |IG| over its
-dimensions, over the sum of all. A zero baseline counts a feature that is large in every image, whether or not
-it distinguishes images; the mean as baseline does not.
+share (Klinghoffer et al., ECCV 2022) is the sum of |IG| over its dimensions, over the sum of all. A zero
+baseline counts a feature that is large in every image; the mean as baseline does not.
 
-Maps are of three kinds. Grad-CAM (Selvaraju et al., ICCV 2017) at the encoder's last spatial convolution is
-the paper's choice. HiResCAM (Draelos and Carin, 2020, arXiv 2011.08891) multiplies gradient and activation
-place by place. The third are integrated gradients of the pixels through the whole encoder. The answer is the
-probe's logit by way of one factor while the others are held. Grad-CAM averages the gradient over places: it
-can light up where the answer does not look, which HiResCAM cannot. Maps are 4 x 4 at the activations: a
-region, not an outline.
+Maps explain the probe's logit by way of one factor, the others held. Grad-CAM (Selvaraju et al., ICCV 2017)
+at the encoder's last spatial convolution is the paper's choice. It averages the gradient over places, so it
+can light up where the answer does not look. HiResCAM (Draelos and Carin, arXiv 2011.08891) multiplies
+gradient and activation place by place. The third are integrated gradients of the pixels.
 
-Sanity check of maps: Adebayo et al., Sanity Checks for Saliency Maps, NeurIPS 2018. A map that stays the
-same when the encoder's weights are drawn anew shows the image, not the model: do not trust it. One that
-stays with shuffled labels shows the encoder's interest, whatever the question. ``another image`` measures
-how much of a map is the same for every image. The verdict goes by Spearman's rank correlation over the places
-of the map. SSIM is that of the maps at the image's size, each divided by its largest value.
+Sanity check of maps: Adebayo et al., NeurIPS 2018. A map that stays the same when the encoder's weights are
+drawn anew shows the image, not the model. One that stays with shuffled labels shows the encoder's interest,
+whatever the question. The verdict goes by Spearman's rank correlation over the places of the map. SSIM is
+that of the maps at the image's size, each divided by its largest value.
 """
 
 from collections.abc import Sequence
@@ -61,14 +57,12 @@ def integrated_gradients(
     *,
     baseline: np.ndarray | None = None,
     output: str = "logit",
-    steps: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The contribution of each dimension to one answer, from the baseline to the image.
 
     ``features`` are (N, D), ``target`` is the number of the label or class. ``baseline`` (D,) is zero by
-    default, as in the paper. ``output`` is "logit" or "probability". ``steps`` of the Gauss-Legendre
-    quadrature are as many as that needs. Returns (N, D) attributions, and (N,) completeness errors: their sum
-    less the change of the answer.
+    default, as in the paper. ``output`` is "logit" or "probability". Returns (N, D) attributions, and (N,)
+    completeness errors: their sum less the change of the answer.
     """
     require_known("output", output, OUTPUTS)
     if features.ndim != 2 or features.shape[1] != probe.weight.shape[1]:
@@ -83,21 +77,15 @@ def integrated_gradients(
             return logits[:, 0]
         return logits.softmax(dim=1)[:, target] if together else logits[:, 0].sigmoid()
 
-    steps = STEPS[output] if steps is None else steps
-    method = captum_attr().IntegratedGradients(answer)
-    start = torch.zeros(1, features.shape[1], dtype=torch.float64)
-    if baseline is not None:
-        start = torch.from_numpy(np.asarray(baseline, np.float64)).reshape(1, -1)
-    portion = max(1, NUMBERS_AT_ONCE // (steps * features.shape[1]))
-    found, errors = [], []
-    for first in range(0, len(features), portion):
-        z = torch.from_numpy(features[first : first + portion].astype(np.float64))
-        attribution, delta = method.attribute(z, start, n_steps=steps, return_convergence_delta=True)
-        found.append(attribution.detach().numpy())
-        errors.append(delta.detach().numpy())
-    if not found:
-        return np.zeros((0, features.shape[1])), np.zeros(0)
-    return np.concatenate(found), np.concatenate(errors)
+    method, z = captum_attr().IntegratedGradients(answer), torch.from_numpy(features.astype(np.float64))
+    if not len(z):
+        return np.zeros(features.shape), np.zeros(0)
+    start = z.new_zeros(1, z.shape[1]) if baseline is None else z.new_tensor(baseline[None])
+    found, error = method.attribute(
+        z, start, n_steps=STEPS[output], return_convergence_delta=True,
+        internal_batch_size=max(len(z), NUMBERS_AT_ONCE // z.shape[1]),
+    )  # fmt: skip
+    return found.detach().numpy(), error.detach().numpy()
 
 
 def factor_shares(attributions: np.ndarray, probe: Probe) -> np.ndarray:
@@ -123,23 +111,20 @@ def saliency(
     length).
     """
     require_known("method", method, METHODS)
-    weight = None if probe is None else factor_weights(probe, factor, targets).to(images)
-    if weight is not None and len(weight) != len(images):
-        raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
+    weight = None
+    if probe is not None:
+        columns = named(probe.slices, factor, "factor of the probe")
+        weight = torch.from_numpy(probe.weight[np.asarray(targets, np.int64), columns]).to(images)
+        if len(weight) != len(images):
+            raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
     if method == "pixels":
-        return pixel_attribution(model, images, factor, weight)[0]
+        return pixel_attribution(model, images, factor, weight)
     features, gradient = _at_features(model, images, factor, weight)
     if method == "grad-cam":
         gradient = gradient.mean(dim=(2, 3), keepdim=True)
     maps = (gradient * features).sum(dim=1)
     own, mirror = maps[: len(images)], maps[len(images) :]
     return (own + mirror.flip(-1) if len(mirror) else own).relu()
-
-
-def factor_weights(probe: Probe, factor: str, targets: Sequence[int] | np.ndarray) -> Float[Tensor, "n code"]:
-    """The probe's weights on one factor's feature, for the target of each image."""
-    columns = named(probe.slices, factor, "factor of the probe")
-    return torch.from_numpy(probe.weight[np.asarray(targets, np.int64), columns])
 
 
 def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " n"]:
@@ -171,8 +156,8 @@ def _at_features(
 
 def pixel_attribution(
     model: Any, images: Float[Tensor, "n 3 h w"], factor: str, weight: Tensor | None
-) -> tuple[Float[Tensor, "n h w"], Float[Tensor, " n"]]:
-    """|IG| of the pixels from a grey image, summed over colours, and the relative completeness error."""
+) -> Float[Tensor, "n h w"]:
+    """|IG| of the pixels from a grey image, summed over colours."""
 
     def answer(pixels: Tensor, own: Tensor | None = None) -> Tensor:
         active = model.factor_activations(factor, pixels)
@@ -180,13 +165,11 @@ def pixel_attribution(
 
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():
-        attribution, delta = captum_attr().IntegratedGradients(answer).attribute(
-            images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS, return_convergence_delta=True,
+        found = captum_attr().IntegratedGradients(answer).attribute(
+            images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS,
             internal_batch_size=max(len(images), 64),
         )  # fmt: skip
-    attribution, delta = attribution.detach(), delta.detach()
-    change = (attribution.sum(dim=(1, 2, 3)) - delta).abs().max().clamp(min=1e-12)
-    return attribution.abs().sum(dim=1).to(images), (delta.abs() / change).to(images)
+    return found.detach().abs().sum(dim=1).to(images)
 
 
 def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size size"]:
@@ -196,17 +179,15 @@ def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size 
 
 def to_one(maps: Float[Tensor, "n y x"]) -> Float[Tensor, "n y x"]:
     """Each map divided by its own largest value; an empty map stays empty."""
-    top = maps.amax(dim=(1, 2), keepdim=True)
-    return torch.where(top > 0, maps / top.clamp(min=torch.finfo(maps.dtype).tiny), 0.0)
+    return maps / maps.amax(dim=(1, 2), keepdim=True).clamp(min=torch.finfo(maps.dtype).tiny)
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """Similarity of the maps of one method and factor before and after a change (of ``CHANGES``).
+    """Similarity of the maps of one method and factor before and after a change.
 
-    ``spearman`` is the mean rank correlation over images and seeds, -1..1, 1 for unchanged, and ``spread``
-    its deviation. ``ssim`` is at most 1. ``empty`` is the share of comparisons left out, a map being empty or
-    flat.
+    ``spearman`` is the mean rank correlation over images and seeds, 1 for unchanged, ``spread`` its
+    deviation. ``empty`` is the share of comparisons left out, a map being empty or flat.
     """
 
     method: str
@@ -217,29 +198,21 @@ class Similarity:
     spread: float
     empty: float
 
-    @property
-    def trusted(self) -> bool | None:
-        """Whether new weights change the map; None where that was not measured."""
-        if self.changed != "random weights" or not np.isfinite(self.spearman):
-            return None
-        return self.spearman < UNCHANGED
-
 
 def sanity_check(
     model: Any,
     probe: Probe,
-    shuffled: Probe | None,
+    shuffled: Probe,
     images: Tensor,
     targets: np.ndarray,
     *,
     methods: Sequence[str] = METHODS,
     seeds: Sequence[int] = (0, 1, 2),
 ) -> list[Similarity]:
-    """Compare the maps of a model with those of the same networks with fresh weights, and more.
+    """Compare the maps of a model with those of fresh weights (by seed), shuffled labels, another image.
 
-    ``probe`` is explained, the same when weights change; ``shuffled`` is one of shuffled labels, or None. Two
-    ``images`` or more are in 0..1, ``targets`` the label or class explained for each; ``seeds`` are of the
-    fresh weights.
+    ``probe`` is explained, ``shuffled`` learned shuffled labels. Two ``images`` or more are in 0..1,
+    ``targets`` the label or class explained for each.
     """
     if len(images) < 2:
         raise ValueError(f"a sanity check compares maps of 2 images or more, got {len(images)}")
@@ -251,14 +224,9 @@ def sanity_check(
                 return saliency(method, net, images, factor, asked, targets)
 
             own = maps(model, probe)
-            others = {
-                "random weights": [maps(twin, probe) for twin in twins],
-                "shuffled labels": [] if shuffled is None else [maps(model, shuffled)],
-                "another image": [own.roll(1, dims=0)],
-            }
-            for changed, them in others.items():
-                if them:
-                    found.append(similarity(method, factor, changed, own, them, images.shape[-1]))
+            fresh, learned = [maps(twin, probe) for twin in twins], maps(model, shuffled)
+            for changed, others in zip(CHANGES, (fresh, [learned], [own.roll(1, dims=0)]), strict=True):
+                found.append(similarity(method, factor, changed, own, others, images.shape[-1]))
     return found
 
 
@@ -269,10 +237,10 @@ def similarity(
     ranks = np.concatenate([spearman(own, other) for other in others])
     ssim = np.concatenate([_ssim(own, other, size) for other in others])
     known = np.isfinite(ranks)
-    if not known.any():
-        return Similarity(method, factor, changed, float("nan"), float("nan"), float("nan"), 1.0)
-    means = float(ranks[known].mean()), float(ssim[known].mean()), float(ranks[known].std())
-    return Similarity(method, factor, changed, *means, float(1 - known.mean()))
+    mean = alike = spread = float("nan")
+    if known.any():
+        mean, alike, spread = map(float, (ranks[known].mean(), ssim[known].mean(), ranks[known].std()))
+    return Similarity(method, factor, changed, mean, alike, spread, float(1 - known.mean()))
 
 
 def spearman(first: Tensor, second: Tensor) -> np.ndarray:

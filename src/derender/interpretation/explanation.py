@@ -1,9 +1,8 @@
 """Which factor answers a question: shares over seeds and images, beside probes that learned nothing.
 
 Every seed chooses training rows and fits a probe; shares and scores are of the test rows, which no seed
-learns from. Controls under the same protocol: the same features with shuffled labels in the training rows,
-and an untrained encoder. ``drop`` is a second opinion without gradients: how much AUC is lost when one
-factor's features are exchanged between test images. Leaves out maps over the image (attribution.py).
+learns from. Controls: the same features with shuffled labels in the training rows, and an untrained encoder.
+``drop`` is a second opinion without gradients: the AUC lost when one factor's features are exchanged.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -66,9 +65,8 @@ class Explained:
         shown += [tables.sanity_table(self.checks)] if self.checks else []
         shown += [tables.cluster_share_table(self.clusters)] if self.clusters is not None else []
         shown += [tables.pair_table(self.pair[1], self.pair[0])] if self.pair is not None else []
-        stuck = (
-            f"not to be trusted, fresh weights give the same map: {m}" for m in tables.untrusted(self.checks)
-        )
+        same = tables.unchanged(self.checks, "random weights")
+        stuck = (f"not to be trusted, fresh weights give the same map: {name}" for name in same)
         values = {"source": self.images.source, "sanity": self.checks, "clusters": self.clusters}
         values |= {**self.shares.numbers(), "pair": None if self.pair is None else self.pair[1]}
         return Scores(shown, values, [*tables.share_verdicts(self.shares), *stuck])
@@ -192,34 +190,27 @@ def explain_labels(
     ((count, train),) = split.train.items()
     if len(train) != len(seeds):
         raise ValueError(f"{len(seeds)} seeds need as many choices of rows, got {len(train)}")
-    fitted: dict[str, list[Probe]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
-    measured: dict[str, list[tuple[np.ndarray, ...]]] = {name: [] for name in fitted}
+    runs: dict[str, list[tuple[Any, ...]]] = {"model": [], "shuffled labels": [], "untrained encoder": []}
     total = 2 * len(seeds) + min(len(untrained), len(seeds))
     for place, (seed, rows) in enumerate(zip(seeds, train, strict=True)):
-        tried = [("model", features, task), ("shuffled labels", features, shuffled(task, rows, seed))]
+        mixed = task.targets.copy()
+        mixed[rows] = mixed[np.random.default_rng(seed).permutation(rows)]
+        tried = [("model", features, task), ("shuffled labels", features, replace(task, targets=mixed))]
         tried += [("untrained encoder", values, task) for values in untrained[place : place + 1]]
         for name, values, asked in tried:
             probe = fit_probe(values, asked, rows, head=head, seed=seed)
             start = None if baseline == "zero" else probe.columns(values)[rows].mean(axis=0)
             z, targets = probe.columns(values)[split.test], task.targets[split.test]
             parts = _shares(probe, z, targets, start, output)
-            fitted[name].append(probe)
-            measured[name].append((*parts, *scores(probe, z, targets, seed)))
+            runs[name].append((probe, *parts, *scores(probe, z, targets, seed)))
             if progress is not None:
-                progress(sum(map(len, measured.values())), total)
-    first = fitted["model"][0]
+                progress(sum(map(len, runs.values())), total)
+    first, shuffled = (runs[name][0][0] for name in ("model", "shuffled labels"))
+    shares = tuple(_row(name, [found for _, *found in own]) for name, own in runs.items() if own)
     return Explanation(
-        task.kind, task.names, first.factors,
-        tuple(_row(name, runs) for name, runs in measured.items() if runs), first,
-        fitted["shuffled labels"][0], count, len(split.test), head, output, baseline,
+        task.kind, task.names, first.factors, shares, first, shuffled, count, len(split.test), head, output,
+        baseline,
     )  # fmt: skip
-
-
-def shuffled(task: Task, rows: np.ndarray, seed: int) -> Task:
-    """The same task with the targets of ``rows`` shuffled among them."""
-    targets = task.targets.copy()
-    targets[rows] = targets[np.random.default_rng(seed).permutation(rows)]
-    return replace(task, targets=targets)
 
 
 def _shares(
@@ -261,28 +252,22 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
     return found
 
 
-def _row(name: str, runs: Sequence[tuple[np.ndarray, ...]]) -> ShareRow:
+def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> ShareRow:
     shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
-    ends, (error, scale) = _interval(_mean(shares)), largest.max(axis=0)
+    known = np.ma.masked_invalid(shares)
+    per_seed, (low, high) = known.mean(axis=1).filled(np.nan), _interval(known.mean(axis=0))
+    error, scale = largest.max(axis=0)
     error = float(error / scale) if scale > 0 else 0.0
-    per_seed = np.stack([_mean(each) for each in shares])
-    return ShareRow(name, name != "model", per_seed, ends[0], ends[1], auc, drop, error)
+    return ShareRow(name, name != "model", per_seed, low, high, auc, drop, error)
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is no NaN; NaN where nothing is."""
-    known = np.isfinite(values)
-    count, total = known.sum(axis=0), np.where(known, values, 0).sum(axis=0)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-
-
-def _interval(shares: np.ndarray) -> np.ndarray:
+def _interval(shares: np.ma.MaskedArray) -> np.ndarray:
     """(T, A, F) as the ends of the 95 % interval of the mean over images, (2, A, F)."""
-    known = np.isfinite(shares).reshape(len(shares), -1).astype(np.float32)
-    values = np.where(np.isfinite(shares), shares, 0).reshape(len(shares), -1).astype(np.float32)
+    flat = shares.reshape(len(shares), -1)
     weights = np.concatenate(list(resamples(len(shares), BOOTSTRAP)))
-    count = weights @ known
-    drawn = np.divide(weights @ values, count, out=np.full(count.shape, np.nan), where=count > 0)
+    count = weights @ (~flat.mask).astype(np.float32)
+    total = weights @ flat.filled(0).astype(np.float32)
+    drawn = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
     ends, some = np.full((2, drawn.shape[1]), np.nan), np.isfinite(drawn).any(axis=0)
     ends[:, some] = np.nanquantile(drawn[:, some], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
     return ends.reshape(2, *shares.shape[1:])

@@ -1,11 +1,8 @@
 """A linear probe on the features of several factors: its question, fitted, written, read.
 
-A question is label columns: classes as they are, numbers cut into bins of equal size.
-
-Two ways to fit are those of ``evaluation/linear_probes.py``. ``logistic`` is the penalised regression, its
-weights taken back to the features as they are. ``linear`` is the paper's head. Weights of classes are centred
-over the classes, which changes no probability and makes the logit of a class its lead over the mean. Leaves
-out scores (``derender.evaluation``).
+A question is label columns: classes as they are, numbers cut into bins of equal size. Two ways to fit are
+those of ``evaluation/linear_probes.py``: ``logistic``, the penalised regression, and ``linear``, the paper's
+head. Weights of classes are centred over the classes: the logit of a class is its lead over the mean.
 """
 
 import json

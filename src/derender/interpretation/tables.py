@@ -1,9 +1,7 @@
 """Shares of factors as values and tables: answers by factor, AUC lost without one, maps checked, groups.
 
-Features of factors stand side by side. Their squared distance is the sum of the squared distances of each
-factor, their cosine the sum of each factor's part of the inner product: parts of clusters and pairs need no
-probe, and nothing is approximated. They depend on the features' scale, as the clustering itself does;
-``ratio`` does not.
+Squared distances of features side by side are sums over factors, and so are cosines: parts of clusters and
+pairs need no probe and are exact. They depend on the features' scale; ``ratio`` does not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from derender.evaluation.score_table import Cell, Column, Interval, Row, ScoreTable, interval_column
-from derender.interpretation.attribution import UNCHANGED, Similarity
+from derender.interpretation.attribution import CHANGES, UNCHANGED, Similarity
 from derender.interpretation.probe import Probe
 
 Features = Mapping[str, np.ndarray]
@@ -21,11 +19,10 @@ Features = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class ClusterShares:
-    """C clusters, of some sizes, each against all other rows, by F factors, (C, F) each.
+    """C clusters, of some sizes, each against all other rows, by F factors, (C, F) each, 0..1.
 
-    ``share`` is the part of the squared distance between the means of cluster and rest, 0..1, and sums to 1
-    over factors. ``ratio`` is the share of the factor's own variance that lies between cluster and rest (eta
-    squared), 0..1, whatever the factor's scale. ``chance`` is the mean ratio for rows shuffled.
+    ``share`` is the part of the squared distance between the means of cluster and rest. ``ratio`` is the
+    share of the factor's own variance that lies between them (eta squared), ``chance`` that of shuffled rows.
     """
 
     names: tuple[str, ...]
@@ -40,10 +37,9 @@ class ClusterShares:
 class PairParts:
     """Parts of the distance and the cosine of two images, (F,) by factor.
 
-    The squared ``distance`` and the ``cosine`` add up to those of the whole features, ``distance_share`` to 1
-    (0 for identical features). ``own_cosine`` is of each factor alone, -1..1, NaN where a feature is 0.
-    ``quantile`` is the share of all pairs of images that lie farther apart in this factor, near 1 where the
-    two are unusually alike.
+    The squared ``distance`` and the ``cosine`` add up to those of the whole features. ``own_cosine`` is of
+    each factor alone, NaN where a feature is 0. ``quantile`` is the share of all pairs of images that lie
+    farther apart in this factor.
     """
 
     factors: tuple[str, ...]
@@ -129,11 +125,9 @@ def _over(part: np.ndarray, whole: np.ndarray | float) -> np.ndarray:
 class ShareRow:
     """Shares of one set of features; S seeds, A labels or classes, F factors.
 
-    ``shares`` (S, A, F) are means over test images of the share of |IG|, 0..1, that sum to 1 over factors.
-    ``low`` and ``high`` (A, F) end the 95 % interval of their mean over seeds. ``auc`` (S, A) is the area
-    under the ROC curve on the test rows, 0.5 at chance, best 1. ``drop`` (S, A, F) is lost when this factor's
-    features are exchanged between images. ``error`` is the largest completeness error over the largest change
-    of an answer.
+    ``shares`` (S, A, F) are means over test images of the share of |IG|, with the 95 % interval ``low`` to
+    ``high`` (A, F). ``auc`` (S, A) is the area under the ROC curve. Of that ``drop`` (S, A, F) is lost when
+    this factor's features are exchanged. ``error`` is the largest completeness error over the largest change.
     """
 
     name: str
@@ -202,15 +196,12 @@ def share_table(found: Explanation) -> ScoreTable:
         columns += [column, interval_column(column, "images")]
     model = found.rows[0]
 
-    def one(answer: int) -> list[Cell]:
-        cells: list[Cell] = []
-        for place, share in enumerate(_means(model.shares[:, [answer]])):
-            cells += [share, Interval(float(model.low[answer, place]), float(model.high[answer, place]))]
-        return [*cells, *_means(model.auc[:, [answer], None])]
-
-    def whole(row: ShareRow) -> list[Cell]:
-        shares = [cell for share in _means(row.shares) for cell in (share, None)]
-        return [*shares, *_means(row.auc[..., None])]
+    def cells(row: ShareRow, answer: int | None) -> list[Cell]:
+        shown: list[Cell] = []
+        ends = np.stack((row.low, row.high), axis=-1).tolist()
+        for place, share in enumerate(_means(row.shares, answer)):
+            shown += [share, None if answer is None else Interval(*ends[answer][place])]
+        return [*shown, *_means(row.auc[..., None], answer)]
 
     what = "yes/no labels" if found.kind == "labels" else "classes, each on its own images"
     seeds = len(model.shares)
@@ -219,23 +210,22 @@ def share_table(found: Explanation) -> ScoreTable:
         f"{found.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(found.names)} {what}; "
         f"{found.output} from a {found.baseline} baseline, completeness error {model.error:.1e}"
     )
-    return _answers(found, caption, [*columns, AUC], one, whole)
+    return _answers(found, caption, [*columns, AUC], cells)
 
 
 def drop_table(found: Explanation) -> ScoreTable:
     """AUC lost when one factor's features are exchanged between the held-out images."""
     columns = [Column(factor, note="AUC lost without this factor") for factor in found.factors]
     caption = "AUC lost when one factor's features are exchanged between images: a check without gradients"
-    drop = found.rows[0].drop
-    return _answers(found, caption, columns, lambda at: _means(drop[:, [at]]), lambda row: _means(row.drop))
+    return _answers(found, caption, columns, lambda row, answer: _means(row.drop, answer))
 
 
-def _answers(found: Explanation, caption: str, columns: Sequence[Column], one: Any, whole: Any) -> ScoreTable:
-    """A row of ``one`` answer each, their mean first, the ``whole`` controls last."""
+def _answers(found: Explanation, caption: str, columns: Sequence[Column], cells: Any) -> ScoreTable:
+    """A row for each answer of the model, their mean (None) first, those of controls last."""
     model, *controls = found.rows
-    rows = [Row(f"mean of {len(found.names)}", whole(model))] if len(found.names) > 1 else []
-    rows += [Row(name, one(answer)) for answer, name in enumerate(found.names)]
-    rows += [Row(row.name, whole(row), True) for row in controls]
+    rows = [Row(f"mean of {len(found.names)}", cells(model, None))] if len(found.names) > 1 else []
+    rows += [Row(name, cells(model, answer)) for answer, name in enumerate(found.names)]
+    rows += [Row(row.name, cells(row, None), True) for row in controls]
     return ScoreTable(caption, "label" if found.kind == "labels" else "class", columns, rows)
 
 
@@ -262,28 +252,21 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
         Column("empty", None, 2, "share of comparisons left out because a map was empty"),
         Column("changes", None, note="whether new weights change the map"),
     )
-    found = {(row.method, row.factor, row.changed): row for row in rows}
+    found: dict[str, dict[str, Similarity]] = {}
+    for row in rows:
+        found.setdefault(f"{row.method}, {row.factor}", {})[row.changed] = row
     lines = []
-    for method, factor in dict.fromkeys((row.method, row.factor) for row in rows):
-        fresh, labels, other = (
-            found.get((method, factor, changed))
-            for changed in ("random weights", "shuffled labels", "another image")
-        )
-        assert fresh is not None
-        word = {True: "yes", False: "no", None: "-"}[fresh.trusted]
-        cells = (fresh.spearman, fresh.ssim, labels and labels.spearman, other and other.spearman)
-        lines.append(Row(f"{method}, {factor}", (*cells, fresh.empty, word)))
+    for name, by_change in found.items():
+        fresh, labels, other = (by_change[changed] for changed in CHANGES)
+        word = "-" if fresh.empty == 1 else "yes" if fresh.spearman < UNCHANGED else "no"
+        cells = (fresh.spearman, fresh.ssim, labels.spearman, other.spearman, fresh.empty, word)
+        lines.append(Row(name, cells))
     return ScoreTable("Do maps change with the learned weights? Similarity, -1 to 1", "map", columns, lines)
 
 
-def untrusted(rows: Sequence[Similarity]) -> list[str]:
-    """The maps that do not change with fresh weights."""
-    return [f"{row.method}, {row.factor}" for row in rows if row.trusted is False]
-
-
-def unasked(rows: Sequence[Similarity]) -> list[str]:
-    """The maps that do not change when the probe learned shuffled labels."""
-    stuck = [row for row in rows if row.changed == "shuffled labels" and row.spearman >= UNCHANGED]
+def unchanged(rows: Sequence[Similarity], changed: str) -> list[str]:
+    """The maps that stay the same after a change, such as "random weights": not to be trusted."""
+    stuck = [row for row in rows if row.changed == changed and row.spearman >= UNCHANGED]
     return [f"{row.method}, {row.factor}" for row in stuck]
 
 
@@ -295,9 +278,8 @@ def cluster_share_table(found: ClusterShares) -> ScoreTable:
     )
     columns = [column for factor in found.factors for column in (Column(factor, note=share), ratio)]
     rows = []
-    for name, size, *parts in zip(
-        found.names, found.sizes, found.share, found.ratio, found.chance, strict=True
-    ):
+    columns_of = (found.names, found.sizes, found.share, found.ratio, found.chance)
+    for name, size, *parts in zip(*columns_of, strict=True):
         cells: list[Cell] = [int(size)]
         for own, between, chance in zip(*parts, strict=True):
             cells += [float(own), f"{between:.3f} ({chance:.3f})"]
@@ -321,7 +303,7 @@ def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
     return ScoreTable(caption, "factor", columns, (*rows, whole))
 
 
-def _means(values: np.ndarray) -> list[float | None]:
-    """(S, A, F) as the mean of what is finite for each factor."""
-    known = [part[np.isfinite(part)] for part in values.reshape(-1, values.shape[-1]).T]
-    return [float(part.mean()) if len(part) else None for part in known]
+def _means(values: np.ndarray, answer: int | None) -> list[float | None]:
+    """(S, A, F) as the mean of what is finite for each factor, over one answer or all."""
+    own = values if answer is None else values[:, [answer]]
+    return np.ma.masked_invalid(own).mean(axis=(0, 1)).tolist()

@@ -1,5 +1,7 @@
 """Curves and areas: the truth scores 1, the light itself scores chance, worse features have lower areas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ def stack(levels: tuple[float, ...] = LEVELS) -> tuple[Trial, np.ndarray, np.nda
     rows = [np.arange(at * part, (at + 1) * part) for at in range(2 + len(levels))]
     angle = np.concatenate([np.zeros(2 * part), *(np.full(part, level) for level in levels)])
     unit = np.concatenate([np.arange(part), *[part + np.arange(part)] * (1 + len(levels))])
-    curve = Curve("light", "light", rows[0], rows[1], levels, tuple(rows[2:]))
+    curve = Curve("light", "light", rows[0], levels, tuple(rows[1:]))
     task = task_of({"identity": np.array(list("abcd"))[who]})
     images = np.zeros((len(who), 3, 2, 2), np.uint8)
     return Trial(images, task, unit, (curve,), "made up"), who, angle
@@ -76,7 +78,7 @@ def test_bad_features_are_refused():
     with pytest.raises(ValueError, match="not finite"):
         compare_robustness({"f": [np.full((len(who), 2), np.nan)]}, trial, SEEDS)
     curve = trial.curves[0]
-    few = Curve("light", "light", curve.learn[:4], curve.ordinary, LEVELS, curve.tested)
+    few = replace(curve, learn=curve.learn[:4])
     with pytest.raises(ValueError, match="light: 4 rows to learn from"):
         Trial(trial.images, trial.task, trial.unit, (few,), "made up")
 

@@ -30,7 +30,7 @@ from derender.evaluation.disentanglement.similarity import (
     pearson,
     similarity,
 )
-from derender.evaluation.disentanglement.swap import Encodings, SwapScores, of_images, swap_test
+from derender.evaluation.disentanglement.swap import SwapScores, swap_test
 from derender.evaluation.memory import Memory
 from derender.evaluation.score_table import Cell, Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
@@ -253,16 +253,6 @@ def disentangle(
     def components() -> np.ndarray:
         return pca_features(images, components=max(len(sizes), min(64, len(images) // 4))).concatenate()
 
-    chosen = {
-        seed: np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images]) for seed in seeds
-    }
-    tested = np.unique(np.concatenate(list(chosen.values())))
-
-    @cache
-    def own_renderings() -> tuple[Encodings, Encodings]:
-        """Of all images that any seed swaps: they are encoded once."""
-        return of_images(model, pixels[tested], batch_size=batch_size)
-
     def made(row: str, seed: int) -> FeatureScores:
         swap, truth, net = None, None, {MODEL: model}.get(row)
         if row == "untrained encoder":
@@ -277,11 +267,8 @@ def disentangle(
         else:
             blocks = features() if net is model else shuffled_rows(features(), seed)
         if net is not None:
-            known = None
-            if net is model:
-                places = np.searchsorted(tested, chosen[seed])
-                known = [{key: each[places] for key, each in part.items()} for part in own_renderings()]
-            swap = swap_test(net, pixels[chosen[seed]], seed=seed, batch_size=batch_size, known=known)
+            chosen = np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
+            swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size)
         if len(factors) >= 2:
             truth = ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
         return FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap)

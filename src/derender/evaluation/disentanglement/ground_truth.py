@@ -3,21 +3,16 @@
 Source: DCI: Eastwood and Williams, ICLR 2018; MIG: Chen et al., NeurIPS 2018; SAP: Kumar et al., ICLR 2018;
 the weights of DCI and 20 bins for MIG as in Locatello et al., ICML 2019.
 
-Each score is computed twice, since one of four features of 256 dimensions is meant to hold a factor, in any
-basis:
+Each score is computed twice. *By feature*, a whole feature counts for its held-out predictions (ridge, in
+similarity.py): R2 of a number; of a class, accuracy above that of the largest class, over the possible gain.
+This is blind to rotations inside a feature, and the score to read. *By dimension*, as published, dimensions
+compete: a factor spread over two dimensions of the right feature costs as much as one held by two features.
 
-    by feature    a feature counts for its held-out predictions (ridge, in similarity.py): R2 of a number; of
-                  a class, accuracy above that of the largest class, over the possible gain. Blind to scale,
-                  order of dimensions and rotations inside a feature. The score to read.
-    by dimension as published: dimensions compete with each other. A factor spread over two dimensions of the
-                  right feature costs as much as one held twice by different features.
-
-All are 0..1 and best at 1; uninformative features score about 0. None asks whether the right feature holds a
-factor; ``placed`` does. True factors are the labels of a rendered set: numbers stay numbers (light, camera),
-names become classes (identity, expression, kind of car).
+All are 0..1 and best at 1; uninformative features score about 0. ``placed`` asks whether the right feature
+holds a factor. True factors are the labels of a rendered set: numbers, or names as classes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,9 +75,8 @@ class ModularityScores:
     """DCI, MIG and SAP; each 0..1, best 1.
 
     Disentanglement: each feature (or dimension) matters for one factor only; completeness: each factor
-    matters in one feature only; informativeness: all features together predict the factors, mean over
-    factors. ``mig`` and ``sap`` are gaps between the best and the second best: of mutual information over the
-    factor's entropy, and of predictive score.
+    matters in one feature only; informativeness: all features together predict the factors. ``mig`` and
+    ``sap`` are gaps between best and second best: of mutual information, and of predictive score.
     """
 
     disentanglement: float
@@ -96,11 +90,9 @@ class ModularityScores:
 class GroundTruthScores:
     """F features against K true factors, by name.
 
-    ``score`` is (F, K): held-out R2 of numbers (negative where the fit does harm), accuracy of classes, best
-    1. ``together`` (K,) is that of all features side by side, ``chance`` (K,) that of a constant answer.
-    ``by_dimension`` and ``grouped_dci`` (importances of dimensions added up by feature) are there where
-    requested. ``placed`` is the share of factors that the right feature predicts best, 0..1; NaN where no
-    feature has a factor of its own.
+    ``score`` is (F, K): held-out R2 of numbers, accuracy of classes, best 1; ``together`` (K,) that of all
+    features side by side, ``chance`` (K,) that of a constant answer. ``grouped_dci`` adds up importances of
+    dimensions by feature. ``placed`` is the share of factors that the right feature predicts best.
     """
 
     features: tuple[str, ...]
@@ -117,9 +109,8 @@ class GroundTruthScores:
 def true_factors(labels: Mapping[str, np.ndarray]) -> tuple[list[TrueFactor], dict[str, str]]:
     """The labels that are factors of a rendered scene, in a fixed order, and by name why others are left out.
 
-    A column is left out when a value is missing or all are the same. So is one with more classes than a fifth
-    of the rows: such classes are names of single images. A set without a column of light or camera is not a
-    rendered one and has none.
+    Left out are columns with missing values, one value or more classes than a fifth of the rows. A set
+    without a column of light or camera is not a rendered one and has none.
     """
     read = {_KNOWN[name][0]: _read(labels[name], *_KNOWN[name]) for name in _KNOWN if name in labels}
     factors = [one for one in read.values() if isinstance(one, TrueFactor)]
@@ -142,11 +133,10 @@ def ground_truth_scores(
     """
     blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
-    found = [_predicted(x, factors, seed) for x in (*blocks.values(), everything)]
-    score, gain = (np.array([[one[part] for one in row] for row in found]) for part in (0, 1))
+    found = (_predicted(x, factors, seed) for x in (*blocks.values(), everything))
+    score, gain, bins = map(np.stack, zip(*found, strict=True))
     share, informativeness = gain[:-1], float(gain[-1].mean())
-    bins = [np.stack([row[k][2] for row in found[:-1]], axis=1) for k in range(len(factors))]
-    mig = float(np.mean([_information_gap(each, factor) for each, factor in zip(bins, factors, strict=True)]))
+    mig = float(np.mean([_information_gap(bins[:-1, k].T, factor) for k, factor in enumerate(factors)]))
     owned = [k for k, factor in enumerate(factors) if set(factor.belongs_to) & set(names)]
     right = [share[:, k].max() > 0 and names[share[:, k].argmax()] in factors[k].belongs_to for k in owned]
     by_dimension = grouped = None
@@ -175,10 +165,9 @@ def ground_truth_scores(
 def importance(codes: np.ndarray, factors: Sequence[TrueFactor], method: str, *, seed: int = 0) -> np.ndarray:
     """(D, K) importance of each dimension of (N, D) codes for each of K factors; each column adds to 1.
 
-    Absolute weights of a lasso on standardised codes (Eastwood and Williams), or importances of gradient
-    boosted trees (Locatello et al.), which ``seed`` belongs to. Classes are regressed as one lasso each, the
-    weights added up. A column is 0 where no dimension helps. The lasso's penalty is a fixed share of the
-    largest useful one, so scaling codes or factors changes nothing; a rotation does.
+    Absolute weights of a "lasso" on standardised codes, added up over classes, or importances of gradient
+    boosted "trees", which ``seed`` belongs to. A column is 0 where no dimension helps. The lasso's penalty is
+    a fixed share of the largest useful one, so scaling codes or factors changes nothing; a rotation does.
     """
     from sklearn.ensemble import GradientBoostingClassifier, GradientBoostingRegressor
 
@@ -244,10 +233,8 @@ def _read(column: np.ndarray, name: str, features: tuple[str, ...]) -> TrueFacto
     return "one class only" if count < 2 else f"{count:,} classes of {len(column):,} images"
 
 
-def _predicted(
-    x: np.ndarray, factors: Sequence[TrueFactor], seed: int
-) -> list[tuple[float, float, np.ndarray]]:
-    """For each factor: score, score above chance in 0..1, and the (N,) binned prediction from one feature."""
+def _predicted(x: np.ndarray, factors: Sequence[TrueFactor], seed: int) -> Iterable[tuple[Any, ...]]:
+    """From one feature, by factor: scores, (K,), those above chance in 0..1, binned predictions, (K, N)."""
     every = np.concatenate([factor.targets for factor in factors], axis=1)
     ends = np.cumsum([factor.targets.shape[1] for factor in factors])[:-1]
     answers = np.split(held_out(x, every, seed=seed), ends, axis=2)
@@ -261,7 +248,7 @@ def _predicted(
             left, total = (np.square(each - factor.targets).sum() for each in (answer, constant))
             score = float(1 - left / total)
         found.append((score, max(0.0, (score - largest) / (1 - largest)), bins))
-    return found
+    return zip(*found, strict=True)
 
 
 def _lasso(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:

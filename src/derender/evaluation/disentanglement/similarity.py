@@ -1,20 +1,14 @@
 """How much two features share: Pearson's correlation, linear CKA and cross-prediction. All are best at 0.
 
-Pearson: Klinghoffer et al., ECCV 2022, Sec. 5. The paper does not define over which values it is taken, so
-both readings are here. With a_i, b_i the vectors of image i in features A and B of N images, and a_p, b_q
-single dimensions over the images:
-
-    per image mean over i of corr(a_i, b_i), signed. Needs vectors of one length and depends on the order of
-                    the dimensions, which has no meaning in a learned code
-    per dimension   mean over p and q of |corr(a_p, b_q)|; shuffled rows score about sqrt(2 / (pi (N - 1)))
+Pearson: Klinghoffer et al., ECCV 2022, Sec. 5, in both readings that the paper allows. *Per image* is the
+mean over images of the signed correlation of two features' vectors. It needs vectors of one length and
+depends on the order of dimensions. *Per dimension* is the mean over pairs of dimensions of |correlation| over
+the N images. Shuffled rows score about sqrt(2 / (pi (N - 1))).
 
 CKA: Kornblith et al., ICML 2019; unbiased with the HSIC estimator of Song et al., JMLR 2012. The biased form
 is far from 0 for independent features of many dimensions. Cross-prediction: ridge regression from one feature
-to another, held out; within each fold every target gets the penalty with the smallest leave-one-out error
-(Allen's PRESS). It does not change with the scale, the order or a rotation of the dimensions.
-
-No low number proves disentanglement: an untrained encoder has about 0.07 per dimension. Read them beside the
-swap test (swap.py). Leaves out kernels other than the linear one and non-linear predictors.
+to another, held out; every target gets the penalty with the smallest leave-one-out error. No low number
+proves disentanglement: read them beside the swap test (swap.py).
 """
 
 from collections.abc import Mapping
@@ -29,9 +23,8 @@ PENALTIES = tuple(10.0**power for power in range(-7, 3))
 class PearsonScores:
     """Correlations between F features, (F, F) each, and their means over pairs of different features, best 0.
 
-    ``per_image`` is -1..1, NaN for different lengths; ``per_dimension`` is the mean |correlation|, 0..1, on
-    the diagonal between different dimensions of one feature. ``n_dead`` dimensions, by feature, are the same
-    in every image and left out.
+    ``per_image`` is NaN for different lengths. ``n_dead`` dimensions, by feature, are the same in every image
+    and left out.
     """
 
     per_image: np.ndarray
@@ -45,8 +38,7 @@ class PearsonScores:
 class SimilarityScores:
     """Similarity of F features, (F, F) each, and means over the pairs of different features, best 0.
 
-    CKA is 0..1 (unbiased, a little below 0 too) and 1 on the diagonal. ``cross_r2`` is the held-out share of
-    the variance of the column's feature that the row's explains, at most 1; below 0 the fit does harm.
+    ``cross_r2`` is the held-out share of the variance of the column's feature that the row's explains.
     """
 
     cka_biased: np.ndarray
@@ -185,8 +177,7 @@ def _unbiased_hsic(x: np.ndarray, y: np.ndarray) -> float:
 
 def _mean(values: np.ndarray) -> float:
     """Mean of all that is not NaN; NaN where nothing is."""
-    defined = values[~np.isnan(values)]
-    return float(defined.mean()) if defined.size else float("nan")
+    return float(np.ma.filled(np.ma.masked_invalid(values).mean(), np.nan))
 
 
 def _mean_of_pairs(matrix: np.ndarray) -> float:

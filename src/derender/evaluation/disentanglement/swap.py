@@ -8,10 +8,9 @@ donor p(i), a random derangement:
     moved[k, j]   = mean_i |swapped_k(i)_j - plain(i)_j|  /  mean_i |plain(i)_j - plain(p(i))_j|
 
 so 0 means that feature j stayed and 1 that it moved as far as two different images are apart. Best: the
-identity matrix. Both ends of a difference are renderings, so the loss of reconstruction does not count; it is
-reported by itself as ``unexchanged``. |.| is the Euclidean distance. The same is done with the decoded
-parameters and with the pixels. Pixels that no surface covers are filled as in training (training/step.py).
-Leaves out whether a swapped image looks right.
+identity matrix. Both ends of a difference are renderings; the loss of reconstruction is reported by itself as
+``unexchanged``. The same is done with the decoded parameters and with the pixels. Pixels that no surface
+covers are filled as in training (training/step.py).
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,9 +33,8 @@ from derender.training.step import fill_uncovered
 class SwapScores:
     """How far F features moved, in units of the mean distance of an image and its donor; NaN where that is 0.
 
-    ``moved`` and ``moved_parameters`` (of decoded depth, albedo, light and camera) are (F, F): row, the
-    factor exchanged, column, what moved; best 1 on the diagonal, 0 elsewhere. (F,) ``moved_pixels`` is the
-    image's own move. ``arrived`` is the remaining distance to the donor's feature, ``unexchanged`` the move
+    ``moved`` and ``moved_parameters`` (decoded) are (F, F): row, the factor exchanged, column, what moved;
+    best the identity. ``arrived`` is the remaining distance to the donor's feature, ``unexchanged`` the move
     from an image to its own rendering, both best 0. Each ``ratio`` is the mean of the diagonal over that of
     the rest, 1 where nothing is disentangled. ``resampled`` (B, 2) has both on resamples of the images.
     """
@@ -77,34 +75,18 @@ def encodings(
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 
-def of_images(model: Any, images: np.ndarray, *, batch_size: int = 64) -> tuple[Encodings, Encodings]:
-    """Encodings of images, and of their own renderings."""
-    inputs = encodings(model, images, batch_size=batch_size)
-    return inputs, encodings(model, images, _decoded(inputs), batch_size=batch_size)
-
-
-def swap_test(
-    model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64,
-    known: Sequence[Encodings] | None = None,
-) -> SwapScores:  # fmt: skip
-    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors.
-
-    ``known`` is what ``of_images`` gives of them, found here by default.
-    """
+def swap_test(model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64) -> SwapScores:
+    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors."""
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")
     names, count = [factor.name for factor in model.factors], len(images)
     parameters = [factor.parameter for factor in model.factors]
     donor = derangement(count, torch.Generator().manual_seed(seed))
-    inputs, plain = known or of_images(model, images, batch_size=batch_size)
-    scene = _decoded(inputs)
-    swapped = [
-        encodings(
-            model, images, scene.with_parameters(**{name: scene.parameters[name][donor]}),
-            batch_size=batch_size,
-        )
-        for name in parameters
-    ]  # fmt: skip
+    inputs = encodings(model, images, batch_size=batch_size)
+    stored = (key for key in inputs if key.startswith("parameter "))
+    scene = Scene.from_parameters({key.removeprefix("parameter "): inputs[key] for key in stored})
+    exchanged = [scene.with_parameters(**{name: scene.parameters[name][donor]}) for name in parameters]
+    plain, *swapped = (encodings(model, images, one, batch_size=batch_size) for one in (scene, *exchanged))
     donors = {key: each[donor] for key, each in plain.items()}
     apart = _distances(plain, donors)
     unit = {key: each.mean() or np.nan for key, each in apart.items()}
@@ -142,11 +124,6 @@ def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
     own = np.eye(len(moved), dtype=bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.divide(moved[own].mean(axis=0), moved[~own].mean(axis=0))
-
-
-def _decoded(found: Encodings) -> Scene:
-    names = (key for key in found if key.startswith("parameter "))
-    return Scene.from_parameters({key.removeprefix("parameter "): found[key] for key in names})
 
 
 def _distances(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

@@ -1,10 +1,8 @@
 """The robustness protocol: a probe learns in ordinary light and view and is tested at every angle.
 
-The area under a curve of accuracy over angle is taken by trapezia and divided by the range of angles: 0 to 1,
-best 1, and it equals the accuracy of an answer that does not depend on the angle. Every seed learns from its
-own four fifths of the training rows. Units (see ``Trial``) are resampled for the intervals, the same for all
-features, all angles and both scores, so that differences are paired. ``robustness`` does all of it in one
-call, from models and images to curves beside controls.
+The area under a curve of accuracy over angle is divided by the range of angles: 0 to 1, best 1. Every seed
+learns from its own four fifths of the training rows. Units (see ``Trial``) are resampled for the intervals,
+the same for all features, angles and scores, so that differences are paired.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -13,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
 from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
+    group_resamples,
     numbers_of,
-    resamples,
     scored_row,
     with_verdicts,
 )
@@ -247,10 +246,9 @@ def level_name(level: float) -> str:
 
 def area_under(levels: Sequence[float], values: np.ndarray) -> np.ndarray:
     """Area under (..., L) values over L growing levels, divided by their range; by trapezia."""
-    x, y = np.asarray(levels, np.float64), np.asarray(values, np.float64)
-    if len(x) < 2 or (np.diff(x) <= 0).any():
+    if len(levels) < 2 or (np.diff(levels) <= 0).any():
         raise ValueError(f"an area needs two growing levels or more, got {list(levels)}")
-    return np.asarray(((y[..., 1:] + y[..., :-1]) / 2 * np.diff(x)).sum(axis=-1) / (x[-1] - x[0]))
+    return np.asarray(trapezoid(values, levels, axis=-1) / (levels[-1] - levels[0]))
 
 
 def compare_robustness(
@@ -276,30 +274,24 @@ def compare_robustness(
     check_lengths(features, len(task))
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
-    shared: dict[bytes, list[Curve]] = {}  # curves that learn from the same rows
+    tested = np.unique(np.concatenate([rows for curve in trial.curves for rows in curve.points]))
+    known: dict[bytes, dict[str, np.ndarray]] = {}  # answers by training rows: most curves share these
+    total, curves, n_learned = len({one.learn.tobytes() for one in trial.curves}) * len(features), [], {}
     for curve in trial.curves:
-        shared.setdefault(curve.learn.tobytes(), []).append(curve)
-    total, done, results, n_learned = len(shared) * len(features), 0, {}, {}
-    for curves in shared.values():
-        learn = curves[0].learn
-        count = max(5, round(LEARNED_SHARE * len(learn)))
-        draws = np.stack([np.random.default_rng(one).permutation(learn)[:count] for one in seeds])
-        tested = np.unique(np.concatenate([rows for curve in curves for rows in curve.points]))
-        answers = {}
-        for name, arrays in features.items():
-            answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
-            done += 1
-            if progress is not None:
-                progress(done, total)
-        answers["majority"] = majority_answers(task, draws, len(tested))
-        for curve in curves:
-            rows = _scored(curve, trial, answers, tested, {*controls, "majority"}, resample_count, seed)
-            sizes = tuple(map(len, curve.points))
-            results[curve.name] = CurveResult(curve.name, curve.title, curve.levels, sizes, rows)
-            n_learned[curve.name] = count
-    ordered = tuple(results[curve.name] for curve in trial.curves)
+        count = n_learned[curve.name] = max(5, round(LEARNED_SHARE * len(curve.learn)))
+        draws = np.stack([np.random.default_rng(one).permutation(curve.learn)[:count] for one in seeds])
+        answers = known.setdefault(curve.learn.tobytes(), {})
+        if not answers:
+            for name, arrays in features.items():
+                answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
+                if progress is not None:
+                    progress(sum(map(len, known.values())), total)
+        both = {**answers, "majority": majority_answers(task, draws, len(tested))}
+        rows = _scored(curve, trial, both, tested, {*controls, "majority"}, resample_count, seed)
+        sizes = tuple(map(len, curve.points))
+        curves.append(CurveResult(curve.name, curve.title, curve.levels, sizes, rows))
     return RobustnessComparison(
-        ordered, trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
+        tuple(curves), trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
     )
 
 
@@ -315,41 +307,24 @@ def _scored(
     """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
     truths = [trial.task.targets[rows] for rows in curve.points]
     places = [np.searchsorted(tested, rows) for rows in curve.points]
-    once = [np.ones((1, len(rows)), np.float32) for rows in curve.points]
-    weights = _weights(curve, trial.unit, count, seed)
+    units = [trial.unit[rows] for rows in curve.points]
+    draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
+    seeds = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
+    drawn = [group_resamples(own, count, one) for own, one in zip(units, seeds, strict=True)]
+    weights = [np.concatenate((np.ones_like(own[:1]), own)) for own in drawn]  # first every row once
     names = (ORDINARY, AREA, *map(level_name, curve.levels))
 
-    def scores(run: np.ndarray, drawn: Sequence[np.ndarray]) -> np.ndarray:
-        """(B, points, 2) both scores, given how often each row of a point is drawn, (B, T) each."""
-        asked = zip(truths, places, drawn, strict=True)
-        return np.stack(
-            [count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked], axis=1
-        )
-
-    def with_area(points: np.ndarray) -> np.ndarray:
-        return np.column_stack((points[:, :1], area_under(curve.levels, points[:, 1:]), points[:, 1:]))
+    def scores(run: np.ndarray) -> np.ndarray:
+        """(1 + B, 1 + points, 2) both scores, the area second."""
+        asked = zip(truths, places, weights, strict=True)
+        ordinary, *levels = (count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked)
+        area = area_under(curve.levels, np.stack(levels, axis=-1))
+        return np.stack((ordinary, area, *levels), axis=1)
 
     found: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
     for name, runs in answers.items():
-        plain = np.concatenate([scores(run, once) for run in runs])
-        resampled = np.mean([scores(run, weights) for run in runs], axis=0)
+        both = np.stack([scores(run) for run in runs])
+        plain, resampled = both[:, 0], both[:, 1:].mean(axis=0)
         for at, rows in enumerate(found.values()):
-            both = with_area(plain[:, :, at]), with_area(resampled[:, :, at])
-            rows.append(scored_row(name, name in controls, names, *both))
+            rows.append(scored_row(name, name in controls, names, plain[..., at], resampled[..., at]))
     return {score: with_verdicts(rows) for score, rows in found.items()}
-
-
-def _weights(curve: Curve, unit: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
-    """For every point, (B, T) how often each of its rows is drawn: as often as its unit.
-
-    Points with the same units share their resamples; others have their own, so that none is ever empty.
-    """
-    drawn: dict[bytes, np.ndarray] = {}
-    found = []
-    for rows in curve.points:
-        names, number = np.unique(unit[rows], return_inverse=True)
-        key = names.tobytes()
-        if key not in drawn:
-            drawn[key] = np.concatenate(list(resamples(len(names), count, seed + 1_000 * len(drawn))))
-        found.append(drawn[key][:, number])
-    return found

@@ -1,16 +1,14 @@
 """Where the images of a trial come from: a generator, a model that re-renders, or labels of the true angles.
 
-generated  Light and view are known because they were set. Face, expression and background depend on seed
-           and index alone: only the angle changes along a curve. Each image is shown from both sides. Probes
-           learn in the generator's usual light and view. For identity other images of the same people are
-           tested, for any other label other people.
-rendered   Real images are decomposed and re-rendered by a model. Training images are renderings too (each
-           scene in its own light and view), so that no curve starts with the step from photograph to
-           rendering. Angles are the model's own, and its features have an advantage: read it beside
-           generated images. Pixels that no surface covers take the mean colour of the image's edge.
+generated  Light and view were set; all else depends on seed and index alone. Each image is shown from both
+           sides. Probes learn in the generator's usual light and view. For identity other images of the same
+           people are tested, for any other label other people.
+rendered   Real images are decomposed and re-rendered by a model. Training images are renderings too, each in
+           its own light and view. Angles are the model's own, and its features have an advantage: read it
+           beside generated images.
 true       The unit is the track where there are tracks, else the image. Of every class, the less rotated
            half of its units is ordinary: three of four learn, the fourth is tested as the curve's first
-           point. The other half is tested in portions, by growing angle. Each angle shows other images.
+           point. The other half is tested in portions, by growing angle.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,12 +23,10 @@ from derender.data import ImageSet
 from derender.data.synthetic import CarSettings, FaceSettings, SyntheticSet, cars, faces
 from derender.evaluation.linear_task import Task, task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust.trial import Axis, Curve, Trial, all_angles, checked_levels, stacked_trial
+from derender.evaluation.robust.trial import Axis, Curve, Trial, all_angles, stacked_trial
 from derender.features import Progress, map_batches, missing, model_fingerprint, named
 from derender.settings import Settings
 from derender.training.step import fill_uncovered
-
-PORTIONS = 3
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,6 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        named(KINDS, self.kind, "kind")
         if self.people < 2 or self.learned < 1 or self.tested < 1:
             raise ValueError(
                 f"generated images need two people or more, each with an image to learn from and one to "
@@ -77,9 +72,9 @@ class Recipe:
     def generate(
         self, part: str, count: int | None = None, axis: Axis | None = None, angle: float = 0.0
     ) -> SyntheticSet:
-        """The images of ``part`` "learned" or "tested" (``count`` of them), in usual light and view or at
-        a fixed angle in degrees. Both parts count people so that numbers agree; indices of images never
-        do, so no seed is shared.
+        """Images of ``part`` "learned" or "tested", in usual light and view or at a fixed angle in degrees.
+
+        Both parts count people so that numbers agree; indices of images never do, so no seed is shared.
         """
         kind, each = KINDS[self.kind], getattr(self, part)
         start = -(-self.people * self.learned // self.tested)  # people before the first one tested
@@ -97,13 +92,12 @@ class Recipe:
 def generated_trial(
     recipe: Recipe,
     axes: Sequence[Axis],
-    levels: Sequence[float],
+    levels: tuple[float, ...],
     *,
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> Trial:
     """Generate the images, or find them in the cache."""
-    levels = checked_levels(levels, axes)
     sample = recipe.generate("tested", 1)
     named({"identity": sample.identity, **sample.labels}, recipe.label, f"label of generated {recipe.kind}")
     inputs = {
@@ -154,7 +148,7 @@ def rendered_trial(
     learn: np.ndarray,
     test: np.ndarray,
     axes: Sequence[Axis],
-    levels: Sequence[float],
+    levels: tuple[float, ...],
     *,
     groups: np.ndarray | None = None,
     memory: Memory | None = None,
@@ -165,7 +159,6 @@ def rendered_trial(
     ``learn`` and ``test`` are row numbers, ``levels`` degrees. Images of one of the (N,) ``groups``, such as
     identities, are resampled together; an image without one, and all without groups, by itself.
     """
-    levels = checked_levels(levels, axes)
     asked, rows = all_angles(axes, levels), np.concatenate((learn, test))
     inputs = {
         "weights": model_fingerprint(model), "images": pictures.images[rows], "n_learn": len(learn),
@@ -195,9 +188,7 @@ def rendered_trial(
     return stacked_trial(images, task.select(rows), number[rows], len(learn), axes, levels, how, dropped)
 
 
-def true_angle_trial(
-    pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = PORTIONS
-) -> Trial:
+def true_angle_trial(pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = 3) -> Trial:
     """Divide images along every axis by their true angles, the more rotated half into portions."""
     tracks = pictures.labels.get("track", np.arange(len(pictures)))
     unit = np.unique(tracks, return_inverse=True)[1].astype(np.int64)
@@ -230,4 +221,4 @@ def _curve(axis: Axis, angle: np.ndarray, unit: np.ndarray, task: Task, portions
             f"the true {axis.title} cannot be cut into {portions} portions of growing angle: the images "
             "are too few, or all at one angle"
         )
-    return Curve(axis.name, f"true {axis.title}", learn, tested[0], levels, tested)
+    return Curve(axis.name, f"true {axis.title}", learn, levels, (tested[0], *tested))

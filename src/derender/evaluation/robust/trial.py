@@ -26,10 +26,9 @@ class Axis:
     """One way to turn light or camera.
 
     ``part`` is that of a generator's settings, "view" or "light"; ``settings`` has, by kind of generated
-    image, the name of the angle's range (degrees) there. ``column`` is that of a scene's camera or light.
-    ``truth`` are the labels (radians) of the angle; two mean the angle of a light's direction off the front.
-    Where the angle is to be the whole angle, the column ``cleared`` of a scene and the setting ``held`` of
-    generated images are 0.
+    image, the name of the angle's range there. ``column`` is that of a scene's camera or light. ``truth`` are
+    the labels (radians) of the angle; two mean a light's direction. The column ``cleared`` of a scene and the
+    setting ``held`` of generated images are set to 0.
     """
 
     name: str
@@ -125,23 +124,16 @@ def all_angles(axes: Sequence[Axis], levels: Sequence[float]) -> list[tuple[Axis
 
 @dataclass(frozen=True)
 class Curve:
-    """Tests at growing angles (degrees), after learning from the rows ``learn`` in ordinary light and view.
+    """Tests at growing ``levels`` (degrees), after learning from rows in ordinary light and view.
 
-    ``ordinary`` rows are tested in that light and view, for every level those in ``tested``; no unit is both
-    learned from and tested.
+    ``points`` are the rows tested: first in that light and view, then at each level.
     """
 
     name: str
     title: str
     learn: Int64[np.ndarray, " n"]
-    ordinary: Int64[np.ndarray, " t"]
     levels: tuple[float, ...]
-    tested: tuple[Int64[np.ndarray, " _"], ...]
-
-    @property
-    def points(self) -> tuple[np.ndarray, ...]:
-        """Rows tested, ordinary ones first."""
-        return (self.ordinary, *self.tested)
+    points: tuple[Int64[np.ndarray, " _"], ...]
 
 
 @dataclass(frozen=True)
@@ -204,7 +196,7 @@ def stacked_trial(
     known = task.known[shown]
     learn, ordinary, *tested = (rows[known[rows]] for rows in parts)
     curves = tuple(
-        Curve(axis.name, axis.title, learn, ordinary, levels, tuple(tested[at : at + len(levels)]))
+        Curve(axis.name, axis.title, learn, levels, (ordinary, *tested[at : at + len(levels)]))
         for axis, at in zip(axes, range(0, len(tested), len(levels)), strict=True)
     )
     return Trial(images, task.select(shown), unit[shown].astype(np.int64), curves, how, n_dropped)

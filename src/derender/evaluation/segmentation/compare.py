@@ -1,17 +1,15 @@
 """Face segmentation from pre-trained U-Net encoders: networks and controls on the same images, over seeds.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3. A seed changes fresh weights (the decoder's
-always) and the order of images, not the split. Runs are cached by the content of their inputs, so that an
-interrupted comparison continues with the next run.
+always) and the order of images, not the split. Each run is cached.
 
 Scores: mean intersection over union, that of the ten best classes, and pixel accuracy. Pixels are counted
-image by image and added up before they are divided, so that the same counts give the scores and their
-resamples. A class that no tested mask shows has no IoU and is left out of every mean, for every answer alike:
-answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
+image by image and added up before they are divided. A class that no tested mask shows is left out of every
+mean; answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from derender.data import read_masks
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, estimate, resamples, with_verdicts
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, resamples, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
 from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
@@ -48,10 +46,8 @@ Progress = Callable[[int, int, str], object]
 class SegmentationRow:
     """One network or control.
 
-    ``scored`` holds ``COLUMNS`` with intervals and differences to the strongest control. ``class_iou`` is
-    (C,), a mean over runs, NaN for classes that no tested mask shows. ``trainable`` counts weights;
-    ``losses`` are (R, epochs), the mean of each epoch. ``shown`` are the first run's (K, S, S) answers for
-    the comparison's ``shown`` images.
+    ``class_iou`` is (C,), a mean over runs, NaN for classes that no tested mask shows. ``trainable`` counts
+    weights; ``losses`` are (R, epochs). ``shown`` are the first run's answers for the comparison's images.
     """
 
     scored: ScoredRow
@@ -195,7 +191,17 @@ def segment(
         losses = nets.train_segmenter(net, data, seed, settings, step)
         return {**counted(nets.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
-    rows: list[tuple[str, bool, list[dict[str, np.ndarray]], int]] = []
+    drawn = np.concatenate(list(resamples(len(data.test), resample_count)))
+    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every image once
+
+    def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
+        found = np.stack([resampled_scores(run["counts"], weights) for run in runs])
+        iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
+        losses = np.array([run["losses"] for run in runs if trainable])
+        scored = scored_row(title, control, tuple(COLUMNS), found[:, 0], found[:, 1:].mean(axis=0))
+        return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
+
+    rows = []
     for name, variant in chosen.items():
         runs, trainable = [], 0
         for seed in seeds:
@@ -209,22 +215,17 @@ def segment(
             runs.append(memory.recall(f"segment-{name}", inputs, partial(trained, net, seed, name)))
             done += each
             report(done, total, name)
-        rows.append((variant.title, not variant.pretrained, runs, trainable))
+        rows.append(row(variant.title, not variant.pretrained, runs, trainable))
     apart = Memory(memory.folder)  # controls are cached as well, but are no runs
     for title, control in CONTROLS.items():
         runs = []
         for seed in seeds if title == "pixel colour" else seeds[:1]:
             made = partial(lambda control, seed: counted(control(data, seed)), control, seed)
             runs.append(apart.recall("segment-control", {**same, "seed": seed, "control": title}, made))
-        rows.append((title, True, runs, 0))
-    weights = np.concatenate(list(resamples(len(data.test), resample_count)))
-    scored = with_verdicts([_scored(title, control, runs, weights) for title, control, runs, _ in rows])
-    made = []
-    for one, (_, _, runs, trainable) in zip(scored, rows, strict=True):
-        iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
-        losses = np.array([run["losses"] for run in runs if "losses" in run])
-        made.append(SegmentationRow(one, iou, trainable, losses, runs[0]["shown"]))
-    found = SegmentationComparison(tuple(made), data, tuple(seeds), settings, shown)
+        rows.append(row(title, True, runs, 0))
+    judged = zip(rows, with_verdicts([row.scored for row in rows]), strict=True)
+    compared = tuple(replace(row, scored=scored) for row, scored in judged)
+    found = SegmentationComparison(compared, data, tuple(seeds), settings, shown)
     return Scores(found.tables(), {"data": data.source, **found.numbers()}, notes, result=found)
 
 
@@ -241,43 +242,23 @@ def count_pixels(answers: np.ndarray, masks: np.ndarray, n_classes: int) -> np.n
 
 def class_iou(counts: np.ndarray) -> np.ndarray:
     """(C,) IoU of each class over (N, 3, C) counts of N images; NaN for one that no mask shows."""
-    return _iou(counts.sum(axis=0)[None])[0]
+    return _iou(counts.sum(axis=0))
 
 
 def resampled_scores(counts: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The scores of ``COLUMNS``, (B, 3), of (N, 3, C) counts; ``weights`` (B, N) say how often each is drawn.
 
-    The ten best classes are those of all images, on every resample.
+    The ten best classes are those of all images.
     """
     drawn = (weights.astype(np.float64) @ counts.reshape(len(counts), -1)).reshape(-1, *counts.shape[1:])
     iou = _iou(drawn)
     accuracy = drawn[:, 0].sum(axis=1) / drawn[:, 2].sum(axis=1)
-    return np.column_stack((_mean_known(iou), _mean_known(iou[:, best_classes(counts)]), accuracy))
-
-
-def best_classes(counts: np.ndarray, number: int = TOP) -> np.ndarray:
-    """The classes with the highest IoU over all images, best first; at most those that the masks show."""
-    iou = class_iou(counts)
-    order = np.argsort(-np.nan_to_num(iou, nan=-1.0), kind="stable")
-    return order[: min(number, int(np.isfinite(iou).sum()))]
-
-
-def _scored(
-    title: str, control: bool, runs: Sequence[Mapping[str, np.ndarray]], weights: np.ndarray
-) -> ScoredRow:
-    plain = np.concatenate([resampled_scores(run["counts"], np.ones_like(weights[:1])) for run in runs])
-    resampled = np.mean([resampled_scores(run["counts"], weights) for run in runs], axis=0)
-    scores = {score: estimate(plain[:, at].tolist(), resampled[:, at]) for at, score in enumerate(COLUMNS)}
-    return ScoredRow(title, control, len(runs), scores)
+    best = np.argsort(-class_iou(counts), kind="stable")[:TOP]  # NaN comes last
+    means = (np.ma.masked_invalid(own).mean(axis=1).filled(0) for own in (iou, iou[:, best]))
+    return np.column_stack((*means, accuracy))
 
 
 def _iou(counts: np.ndarray) -> np.ndarray:
-    """(B, C) intersection over union of (B, 3, C) counts; NaN for classes that are not there."""
-    right, answered, there = np.moveaxis(counts.astype(np.float64), 1, 0)
+    """(..., C) intersection over union of (..., 3, C) counts; NaN for classes that are not there."""
+    right, answered, there = np.moveaxis(counts.astype(np.float64), -2, 0)
     return np.divide(right, answered + there - right, out=np.full(right.shape, np.nan), where=there > 0)
-
-
-def _mean_known(values: np.ndarray) -> np.ndarray:
-    """Mean over the classes that are there; a resample of images always shows at least one."""
-    known = np.isfinite(values)
-    return np.where(known, values, 0).sum(axis=1) / known.sum(axis=1).clip(min=1)

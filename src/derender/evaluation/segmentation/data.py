@@ -106,9 +106,9 @@ def by_colour(data: SegmentationData, seed: int = 0) -> np.ndarray:
     """(T, S, S): logistic regression from a pixel's red, green and blue alone, on 20,000 training pixels."""
     from sklearn.linear_model import LogisticRegression
 
-    def colours(rows: np.ndarray) -> np.ndarray:
-        """Every pixel of some images, (pixels, 3) in -2..2, where the regression's penalty is mild."""
-        return np.moveaxis(data.images[rows], 1, -1).reshape(-1, 3).astype(np.float64) / 63.75 - 2
+    def colours(pixels: np.ndarray) -> np.ndarray:
+        """In -2..2, where the regression's penalty is mild."""
+        return pixels.astype(np.float64) / 63.75 - 2
 
     masks = data.masks.reshape(len(data.masks), -1)
     pool = masks[data.train].size
@@ -117,9 +117,8 @@ def by_colour(data: SegmentationData, seed: int = 0) -> np.ndarray:
     flat, classes = data.images.reshape(len(masks), 3, -1), masks[rows, places]
     if len(np.unique(classes)) == 1:
         return np.full(data.masks[data.test].shape, classes[0], np.uint8)
-    regression = LogisticRegression(max_iter=1_000)
-    regression.fit(flat[rows, :, places].astype(np.float64) / 63.75 - 2, classes)
-    answers = [regression.predict(colours(row)) for row in data.test[:, None]]
+    regression = LogisticRegression(max_iter=1_000).fit(colours(flat[rows, :, places]), classes)
+    answers = [regression.predict(colours(flat[row].T)) for row in data.test]
     return np.stack(answers).reshape(data.masks[data.test].shape).astype(np.uint8)
 
 

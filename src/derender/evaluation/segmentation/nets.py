@@ -1,12 +1,11 @@
 """The networks that are compared, how they are trained, and their answers.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs.
-Neither the loss nor the batch size is stated: cross-entropy, every pixel alike, and 64, or fewer where there
-are few images. The paper's only control is one encoder from fresh weights, while its best row joins two; this
-table adds two fresh encoders, trained and frozen. A pre-trained encoder keeps its BatchNorm statistics while
-its weights learn, since small batches have unreliable ones. A fresh encoder that is frozen gets those of the
-training images. The paper's decoder is always fresh; one network begins with the decoder that was distilled
-beside the encoders. Leaves out augmentation, class weights and early stopping: the last weights are scored.
+Neither the loss nor the batch size is stated: cross-entropy, and 64, or fewer of few images. To the paper's
+control, one encoder from fresh weights, this table adds two fresh encoders, trained and frozen. A pre-trained
+encoder keeps its BatchNorm statistics while its weights learn; a fresh one that is frozen gets those of the
+training images. One network begins with the decoder that was distilled beside the encoders. Leaves out
+augmentation, class weights and early stopping.
 """
 
 import copy
@@ -25,7 +24,8 @@ from torch.optim.swa_utils import update_bn
 
 from derender.data import as_float
 from derender.evaluation.segmentation.data import SegmentationData
-from derender.features import named
+from derender.features import map_batches, named
+from derender.features.extract import as_batch
 from derender.networks.encoders import UNetDecoder, UNetEncoder
 from derender.settings import Settings
 from derender.training.process import freed_memory_kept
@@ -105,9 +105,8 @@ def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str,
 class SegmentationNet(nn.Module):
     """Images in 0..1 to one logit a class and pixel, from U-Net encoders and a decoder over all of them.
 
-    ``frozen`` encoders never change. With ``kept_statistics`` their BatchNorm keeps its statistics in
-    training, too. Beside a learnt ``decoder``, of which all but the last layer is taken, only the two finest
-    levels of either do.
+    ``frozen`` encoders never change. With ``kept_statistics`` their BatchNorm keeps its statistics. Beside a
+    learnt ``decoder``, of which all but the last layer is taken, only the two finest levels of either do.
     """
 
     def __init__(
@@ -134,12 +133,17 @@ class SegmentationNet(nn.Module):
             self.decoder = copy.deepcopy(decoder).requires_grad_(True)
             last = decoder.to_outputs
             self.decoder.to_outputs = nn.Conv2d(last.in_channels, outputs, 1, device=last.weight.device)
-        self.frozen, self.kept_statistics = frozen, frozen or kept_statistics
+        self.frozen = frozen
         self._fixed: list[nn.Module] = []  # parts whose BatchNorm keeps its statistics
-        if self.kept_statistics:
-            finest = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
-            self._fixed += [self.encoders] if frozen or decoder is None else finest
-            self._fixed += [] if decoder is None else [self.decoder.convolve[-LEVELS_KEPT:]]
+        if decoder is not None:
+            self._fixed = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
+            self._fixed.append(self.decoder.convolve[-LEVELS_KEPT:])
+        elif frozen or kept_statistics:
+            self._fixed = [self.encoders]
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
 
     def train(self, mode: bool = True) -> "SegmentationNet":
         super().train(mode)
@@ -190,21 +194,19 @@ def train_segmenter(
 
     The seed orders the images; ``progress`` is called with (images seen, loss) after every step.
     """
-    device = next(net.parameters()).device
     net.to(memory_format=torch.channels_last).train()  # pyright: ignore[reportCallIssue]
     learning = [parameter for parameter in net.parameters() if parameter.requires_grad]
     optimiser = torch.optim.Adam(learning, lr=settings.learning_rate, betas=settings.betas, fused=True)
     generator, seen, means = torch.Generator().manual_seed(seed), 0, []
     batch_size = settings.batch_for(len(data.train))
-    with freed_memory_kept() if device.type == "cpu" else nullcontext():
+    with freed_memory_kept() if net.device.type == "cpu" else nullcontext():
         for _ in range(settings.epochs):
             order = data.train[torch.randperm(len(data.train), generator=generator).numpy()]
             total = 0.0
             for start in range(0, len(order), batch_size):
                 rows = order[start : start + batch_size]
-                images = as_float(data.images[rows]).to(device, memory_format=torch.channels_last)
-                truth = torch.from_numpy(data.masks[rows]).to(device).long()
-                loss = cross_entropy(net(images), truth)
+                truth = torch.from_numpy(data.masks[rows]).to(net.device).long()
+                loss = cross_entropy(net(as_batch(data.images[rows], net.device)), truth)
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()
@@ -216,11 +218,10 @@ def train_segmenter(
     return means
 
 
-@torch.inference_mode()
-def answer(net: SegmentationNet, images: np.ndarray, batch_size: int = 128) -> np.ndarray:
+def answer(net: SegmentationNet, images: np.ndarray) -> np.ndarray:
     """(N, S, S) uint8: the likeliest class of every pixel of (N, 3, S, S) uint8 images."""
-    device = next(net.parameters()).device
-    net.eval()
-    parts = (images[start : start + batch_size] for start in range(0, len(images), batch_size))
-    logits = (net(as_float(part).to(device)) for part in parts)
-    return np.concatenate([one.argmax(dim=1).to(torch.uint8).cpu().numpy() for one in logits])
+
+    def likeliest(batch: Tensor) -> np.ndarray:
+        return net(batch).argmax(dim=1).to(torch.uint8).cpu().numpy()
+
+    return np.concatenate(map_batches(likeliest, net, images, batch_size=128))
