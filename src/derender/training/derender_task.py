@@ -15,9 +15,7 @@ from torch import Generator, Tensor, nn
 from derender.data import ImageSet, split_indices
 from derender.model import Derenderer, load
 from derender.networks.factors import GEOMETRY_START
-from derender.objectives import load_vgg16
-from derender.objectives.perceptual import build_perceptual
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeatures, load_vgg16
 from derender.objectives.self_features import load_self_features, train_self_features
 from derender.postprocess import Features
 from derender.postprocess.whitening import Whitening
@@ -185,8 +183,9 @@ def perceptual_of(
             run.perceptual, images, config.seed, objective.self_features_steps, progress
         )
     else:
-        seen = images if objective.perceptual_rescaled else None
-        features = build_perceptual("vgg16", seen, weights=objective.vgg16_path, device=images.device)
-    if config.channels_last and features is not None:
+        features = load_vgg16(objective.vgg16_path).to(images.device)
+        if objective.perceptual_rescaled:
+            features.calibrate_(images[:CALIBRATION_IMAGES].float() / 255)
+    if config.channels_last:
         features = features.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     return features

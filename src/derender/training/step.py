@@ -17,8 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from derender.model import Derenderer
 from derender.networks.decoders import Confidence
 from derender.objectives.loocc import loocc_loss
-from derender.objectives.perceptual import perceptual_loss
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
 from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
 from derender.render import Rendering
 from derender.scene import Scene
