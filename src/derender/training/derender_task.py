@@ -63,7 +63,8 @@ def _add_features(
 ) -> None:
     """Estimate a trained model's features and held-out errors, and save both with it."""
     split = split_indices(images.files, config.split, seed=config.seed)
-    some = torch.from_numpy(some_of(images.images, split.train))
+    mapped = isinstance(images.images, np.memmap)
+    some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
     told = partial(Progress, "features")
     model = make_features(
         model, some, config.features, seed=config.seed, progress=lambda *done: report(told(*done))
