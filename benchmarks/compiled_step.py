@@ -22,7 +22,7 @@ from torch import Tensor
 from training_step import seconds
 
 from derender.model import Derenderer
-from derender.objectives import Vgg16Features
+from derender.objectives.perceptual import Vgg16Features
 from derender.objectives.self_features import SelfFeatures
 from derender.training.config import resolve
 from derender.training.process import freed_memory_kept

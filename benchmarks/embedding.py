@@ -35,7 +35,7 @@ from training_step import CONFIG, OurStep, seconds
 from derender.data import Sample, Stream, as_float, open_images
 from derender.features import FeatureTable, embed_images, embed_to_file
 from derender.model import Derenderer
-from derender.objectives import Vgg16Features
+from derender.objectives.perceptual import Vgg16Features
 
 SIZE = 64
 CODES = {"geometry": 256, "albedo": 256, "light": 256, "camera": 256}

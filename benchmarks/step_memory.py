@@ -18,7 +18,7 @@ import torch
 from machine import parser, publish
 
 from derender.model import Derenderer
-from derender.objectives import Vgg16Features
+from derender.objectives.perceptual import Vgg16Features
 from derender.training.config import resolve
 from derender.training.step import training_step
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from derender.model import Derenderer
-from derender.objectives import Vgg16Features
+from derender.objectives.perceptual import Vgg16Features
 from derender.training.config import resolve
 from derender.training.process import freed_memory_kept
 from derender.training.step import training_step

@@ -44,9 +44,7 @@ class ModelSettings(Settings):
 
 
 MODEL_PRESETS: dict[str, ModelSettings] = {
-    "paper": ModelSettings(),
-    "faces": ModelSettings(),
-    "cats": ModelSettings(),
+    **dict.fromkeys(("paper", "faces", "cats"), ModelSettings()),
     "cars": ModelSettings(ranges=SceneRanges(border_depth=1.08, diffuse=(0.5, 1.0))),
     "small": ModelSettings(network=NetworkSettings(width=16, light_width=8)),
 }

@@ -7,17 +7,16 @@ import pytest
 import torch
 from torch import nn
 
-from derender.objectives.perceptual import build_perceptual, perceptual_loss
-from derender.objectives.perceptual_features import PerceptualFeatures
-from derender.objectives.self_features import SelfFeatures
+from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
+from derender.training import resolve
+from derender.training.derender_task import perceptual_of
+from derender.training.run_folder import RunFolder
 
 
 class Tiny(PerceptualFeatures):
     """Two random convolutions at half resolution."""
 
-    kind = "tiny"
-    stride = 2
-    channels = 4
+    stride, channels = 2, 4
 
     def __init__(self, generator: torch.Generator):
         layers = nn.Sequential(nn.Conv2d(3, 4, 3, padding=1), nn.ReLU(), nn.AvgPool2d(2))
@@ -92,22 +91,14 @@ def test_frozen_whatever_the_model_around_does(generator):
     assert gradient.abs().sum() > 0
 
 
-def test_vgg_is_calibrated_on_the_first_256_pictures_or_keeps_scale_1(monkeypatch):
+def test_vgg_is_calibrated_on_the_first_256_pictures_or_keeps_scale_1(monkeypatch, tmp_path):
     def weights(_: object) -> Tiny:
         return Tiny(torch.Generator().manual_seed(3))
 
-    monkeypatch.setattr("derender.objectives.perceptual.load_vgg16", weights)
+    monkeypatch.setattr("derender.training.derender_task.load_vgg16", weights)
     images = (torch.rand(258, 3, 6, 8, generator=torch.Generator().manual_seed(0)) * 255).byte()
     expected = weights(None).calibrate_(images[:256].float() / 255).scale
-    assert torch.equal(build_perceptual("vgg16", images).scale, expected)
-    assert build_perceptual("vgg16").scale == 1
-
-
-def test_the_factory_knows_its_kinds(generator, tmp_path):
-    images = (torch.rand(4, 3, 32, 32, generator=generator) * 255).byte()
-    assert build_perceptual("none") is None
-    assert isinstance(build_perceptual("self", images, seed=1, steps=1), SelfFeatures)
-    with pytest.raises(ValueError, match="give images"):
-        build_perceptual("self")
-    with pytest.raises(ValueError, match="no VGG16 weights at"):
-        build_perceptual("vgg16", weights=tmp_path / "absent.npz")
+    for rescaled, scale in ((True, expected), (False, torch.ones(()))):
+        config = resolve("small", ["perceptual=vgg16", f"perceptual_rescaled={str(rescaled).lower()}"])
+        made = perceptual_of(config, RunFolder(tmp_path), images, lambda done, total: None)
+        assert torch.equal(made.scale, scale)

@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import save_file
 from torch.nn import functional
 
-from derender.objectives.perceptual_features import Vgg16Features, load_vgg16
+from derender.objectives.perceptual import Vgg16Features, load_vgg16
 from derender.storage.tensors import reads_safely
 
 PICKLED = pytest.mark.skipif(not reads_safely(), reason="this PyTorch is not trusted with pickles")

@@ -5,7 +5,7 @@ import torch
 from torch.torch_version import TorchVersion
 
 from derender.networks.unsup3d import read_checkpoint
-from derender.objectives.perceptual_features import load_vgg16
+from derender.objectives.perceptual import load_vgg16
 from derender.storage.tensors import UNIT, packed, read_tensors, reads_safely, write_tensors
 
 

@@ -14,7 +14,7 @@ from torch import distributed
 
 from derender.cli import main as command
 from derender.model import Derenderer
-from derender.objectives import SelfFeatures
+from derender.objectives.self_features import SelfFeatures
 from derender.render import render_scene
 from derender.training.config import ObjectiveSettings, resolve
 from derender.training.distributed import ALONE, Ranks, leave, open_fabric, ranks_of

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from derender.model import Derenderer
-from derender.objectives import SelfFeatures
+from derender.objectives.self_features import SelfFeatures
 from derender.render import render_scene
 from derender.training.config import ObjectiveSettings, resolve
 from derender.training.step import training_step

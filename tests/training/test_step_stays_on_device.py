@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from derender.data import ImageSet
 from derender.model import Derenderer
-from derender.objectives import Vgg16Features
+from derender.objectives.perceptual import Vgg16Features
 from derender.training import loop, train
 from derender.training.config import resolve
 from derender.training.step import training_step

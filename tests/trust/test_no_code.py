@@ -16,7 +16,7 @@ from derender.baselines import load_baseline
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
 from derender.networks.unsup3d import read_checkpoint
-from derender.objectives.perceptual_features import _read_weights
+from derender.objectives.perceptual import _read_weights
 from derender.storage.atomic import DamageNoticed
 from derender.storage.tensors import reads_safely
 from derender.training import resolve

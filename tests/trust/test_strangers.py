@@ -28,7 +28,7 @@ from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation.probe import load_probe
 from derender.learn.plan import read_plan
 from derender.networks.unsup3d import read_checkpoint
-from derender.objectives.perceptual_features import _read_weights
+from derender.objectives.perceptual import _read_weights
 from derender.objectives.self_features import load_self_features
 from derender.report.run import run_page
 from derender.storage.atomic import check_seal

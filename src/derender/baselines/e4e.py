@@ -25,7 +25,7 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, ms
 from derender.baselines.generator import Codes, EqualLinear, Generator, GeneratorSettings, Side
 from derender.baselines.model import BaselineConfig, BaselineSettings, Features, Images, LoopModel, LossInputs
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual import PerceptualFeatures
 from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.derender_task import self_features_of

@@ -37,7 +37,7 @@ from derender.evaluation.score_table import Scores, scored_table
 from derender.features import map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual import PerceptualFeatures
 from derender.storage.atomic import atomic_file, new_folder
 from derender.storage.bounded import read_json
 from derender.storage.tensors import read_tensors, write_tensors

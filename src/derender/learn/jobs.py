@@ -72,8 +72,8 @@ class Job:
     def name(self) -> str:
         """In words."""
         relation = {"train": "on", "embed": "of", "score": ""}[self.kind]
-        run = f" seed {self.seed}" if self.seed else ""
-        return " ".join(f"{self.kind} {self.method}{run} {relation} {self.where}".split())
+        run = f"seed {self.seed}" if self.seed else ""
+        return " ".join(filter(None, (self.kind, self.method, run, relation, self.where)))
 
     @property
     def slug(self) -> str:

@@ -23,7 +23,6 @@ OURS = "derender"
 KINDS = (OURS, *BASELINES)
 ALWAYS_THERE = ("pixels", "pca", "untrained")  # every table has these controls
 WITHOUT_LOOP = ("resnet18", "ris")  # trained, but not by the training loop: no number of images seen
-RESERVED = ("images", "split", "seed")  # the plan's own
 
 
 def _methods(given: Any) -> Any:
@@ -162,12 +161,11 @@ def _faults(plan: Plan) -> Iterator[str]:
             if own or method.kind or method.model:
                 yield f"method {name!r} is like {like!r}: it takes features and whitened alone"
         if (kind := plan.kind(name)) not in KINDS:
-            choices = f"{suggestion(kind, KINDS)}: choose {', '.join(KINDS)}"
-            yield f"method {name!r} is of no known kind{choices}"
+            yield f"method {name!r} is of no known kind{suggestion(kind, KINDS)}: choose {', '.join(KINDS)}"
         for where in (*method.runs, *method.settings_on):
             named(plan.train, where, "training set")
         given = [plan.settings, method.settings, *method.settings_on.values()]
-        for key in RESERVED:
+        for key in ("images", "split", "seed"):
             if any(key in one for one in given):
                 yield f"{key} is the plan's own and the same for all: not in settings of {name!r}"
         if own and kind not in (OURS, *TRAINED):

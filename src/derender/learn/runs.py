@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,34 +110,36 @@ def train(
     if this_rank_writes() and not resume:
         refuse_taken(out)
     with fabric.rank_zero_first(local=True):
-        images = as_images(
-            images, image_size_of(config), dataset=dataset, limit=limit,
-            progress=lambda *counts: report(Progress("reading", *counts)),
-        )  # fmt: skip
+        images = _read(images, image_size_of(config), report, dataset, limit)
     if on_images is not None:
         on_images(images)
-    how: dict[str, Any] = {"resume": resume, "progress": report, "accelerator": accelerator}
-    if isinstance(config, TrainConfig):
-        how["sample_sheet"] = lambda *given: _pages().decomposition_sheet(*given)
-        result = derender_task.train(config, images, out, **how)
-    else:
-        how["sample_sheet"] = lambda columns: _pages().baseline_sheet(columns)
-        result = train_baseline(config, images, out, **how)
+    ours = isinstance(config, TrainConfig)
+
+    def sheet(*given: Any) -> Any:
+        from derender.report import run as pages  # its import would delay the start by seconds
+
+        return (pages.decomposition_sheet if ours else pages.baseline_sheet)(*given)
+
+    how = {"resume": resume, "progress": report, "accelerator": accelerator, "sample_sheet": sheet}
+    result = (derender_task.train if ours else train_baseline)(config, images, out, **how)
     writes = this_rank_writes()
     leave()
     if writes and page:
         from derender.report.evidence import Evidence, look_at_data
+        from derender.report.run import run_page
 
-        examined = Evidence({"data": look_at_data(images)})
-        _pages().run_page(out, examined).write(out / "report.html")
+        run_page(out, Evidence({"data": look_at_data(images)})).write(out / "report.html")
     return result
 
 
-def _pages() -> Any:
-    """report/run.py, whose import would delay the start of a training by seconds."""
-    from derender.report import run
-
-    return run
+def _read(
+    images: ImageSet | str | Path, image_size: int, report: Callable[[Progress], None], dataset: str,
+    limit: int | None,
+) -> ImageSet:  # fmt: skip
+    told = partial(Progress, "reading")
+    return as_images(
+        images, image_size, dataset=dataset, limit=limit, progress=lambda *counts: report(told(*counts))
+    )
 
 
 def texts_of(settings: Changes) -> list[str]:
@@ -191,11 +194,11 @@ def finetune_settings(
         values = config.model_dump(mode="json", include=kept)
         start = as_model(model, device="cpu")
         config = FinetuneConfig(**values, model=start.settings, start=str(model))
-    target: dict[str, Any] = {"weight": weight, "rendering_weight": rendering_weight, "labelled": labelled}
-    target |= {"labels": list(dict.fromkeys(labels or ())) or None}
-    target |= {"factors": None if factors is None else list(factors)}
-    changes = {f"target__{name}": value for name, value in target.items()}
-    return with_changes(config, texts_of(settings or ()), **changes)
+    return with_changes(
+        config, texts_of(settings or ()), target__weight=weight, target__rendering_weight=rendering_weight,
+        target__labelled=labelled, target__labels=list(dict.fromkeys(labels or ())) or None,
+        target__factors=None if factors is None else list(factors),
+    )  # fmt: skip
 
 
 def finetune(
@@ -226,10 +229,7 @@ def finetune(
     if not resume:
         refuse_taken(out)
     start = None if config.start is None else as_model(config.start, device="cpu")
-    images = as_images(
-        images, config.model.network.image_size, dataset=dataset, limit=limit,
-        progress=lambda *counts: report(Progress("reading", *counts)),
-    )  # fmt: skip
+    images = _read(images, config.model.network.image_size, report, dataset, limit)
     if on_images is not None:
         on_images(images)
     if choices.get("attributes"):
@@ -237,12 +237,12 @@ def finetune(
             raise ValueError(f"{images.source} has no yes/no label: name one in labels")
         config = with_changes(config, target__labels=list(columns))
     task = FinetuneTask(config, images.images, target_of(images, config), start)
-    how = {"resume": resume, "progress": report, "accelerator": accelerator}
     from derender.report.run import decomposition_sheet, run_page
 
     run = train_task(
-        task, images, out, sample_sheet=lambda tuned, few: decomposition_sheet(tuned.model, few), **how
-    )
+        task, images, out, resume=resume, progress=report, accelerator=accelerator,
+        sample_sheet=lambda tuned, few: decomposition_sheet(tuned.model, few),
+    )  # fmt: skip
     run_page(out).write(out / "report.html")
     if not (out / "model").is_dir():
         raise ValueError(f"{out} has no model: training collapsed before the first held-out score")

@@ -146,9 +146,6 @@ def _costs_and_absent(plan: Plan, job: Job, notes: Notes) -> dict[str, Any]:
     return {"costs": costs, "absent": absent}
 
 
-WORK = {"train": train, "embed": embed, "score": score}
-
-
 def compare_plan(
     plan: Plan | str | Path,
     out: str | Path,
@@ -219,8 +216,9 @@ def compare_plan(
 def perform(at: Comparison, job: Job) -> Note:
     """Do one job and leave its note, whatever happens in it."""
     try:
+        work = {"train": train, "embed": embed, "score": score}[job.kind]
         with at.bar(job.name, unit="steps" if job.kind == "score" else "images") as progress:
-            return at.leave(job, facts=WORK[job.kind](at, job, progress))
+            return at.leave(job, facts=work(at, job, progress))
     except TrainingInterrupted:
         if not at.over:
             raise

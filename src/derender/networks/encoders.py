@@ -24,7 +24,6 @@ Images = Float[Tensor, "n 3 h w"]
 Code = Float[Tensor, "n code"]
 Spatial = Float[Tensor, "n channels y x"]
 
-
 LARGEST = 1 << 16  # of channels and codes; more is no network
 
 

@@ -118,9 +118,7 @@ def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[
         centred = centred + math.tan(math.radians(ranges.lean_deg)) * up[:, None] / half
     depth = middle + half * centred.tanh()
     columns = ranges.border_columns(width)
-    if columns == 0:
-        return depth
-    return pad(depth[..., columns:-columns], (columns, columns), value=ranges.border_depth)
+    return pad(depth[..., columns : width - columns], (columns, columns), value=ranges.border_depth)
 
 
 def level(values: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:

@@ -25,8 +25,6 @@ from derender.storage.tensors import check_pickle, require_plain
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
 OPTIONAL = "netC"
-LIGHT_ROWS = [0, 1, 3, 2]
-"""Ambient, diffuse, pitch, yaw out of ambient, diffuse, x, y: x is the tangent of yaw, y that of pitch."""
 MOST_UNKNOWN = 50
 """Kinds of objects in one file."""
 
@@ -58,10 +56,10 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
             f"{file} holds {type(content).__name__}, no checkpoint of unsup3d: expected netD and others"
         )
     theirs = {net: _tensors(content, net, file) for net in NETS}
-    missing = [net for net, tensors in theirs.items() if not tensors and net != OPTIONAL]
-    if missing:
-        holds = ", ".join(sorted(map(str, content))[:8]) or "nothing"
-        raise ValueError(f"{file} is no checkpoint of unsup3d: it has no {missing[0]} (it holds {holds})")
+    for net, tensors in theirs.items():
+        if not tensors and net != OPTIONAL:
+            holds = ", ".join(sorted(map(str, content))[:8]) or "nothing"
+            raise ValueError(f"{file} is no checkpoint of unsup3d: it has no {net} (it holds {holds})")
     settings = _sizes(theirs, file)
     with torch.device("meta"):  # without memory
         ours: dict[str, nn.Module] = {factor.name: factor.build(settings) for factor in FACTORS}
@@ -71,7 +69,7 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
         if theirs[net]:
             weights |= _renamed(theirs[net], ours[name], net, file)
     key = next(name for name in reversed(weights) if name.startswith("nets.light."))
-    weights[key] = weights[key][LIGHT_ROWS]
+    weights[key] = weights[key][[0, 1, 3, 2]]  # x is the tangent of yaw, y that of pitch
     return settings, weights
 
 

@@ -1,22 +1,36 @@
-"""The perceptual loss, and the one place that makes the features it compares.
+"""The perceptual loss, and the frozen features that it compares: what all share, and VGG16 up to relu3_3.
 
-Source: unsup3d (Wu et al., CVPR 2020), Eq. 7: a Gaussian of the feature difference, with a confidence per
-feature location.
+Source of the loss: unsup3d (Wu et al., CVPR 2020), Eq. 7: a Gaussian of the feature difference, with a
+confidence per feature location. Features are divided by one number measured on a calibration batch, so that
+confidence terms mean the same whichever weights are used. Source of VGG16: Simonyan & Zisserman 2015
+(configuration D), weights from disk. Leaves out self-supervised features (self_features.py) and downloading.
 """
 
-from collections.abc import Callable
+import pickle
+import zipfile
+import zlib
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError
+from torch import Tensor, nn
 from torch.nn import functional
 
-from derender.objectives.perceptual_features import CALIBRATION_IMAGES, PerceptualFeatures, load_vgg16
 from derender.objectives.reconstruction import at_least_float32, bounded_sigma, masked_mean
-from derender.objectives.self_features import train_self_features
+from derender.storage.tensors import check_fit, check_pickle, read_tensors, require_plain
 
-PERCEPTUAL_KINDS = ("vgg16", "self", "none")
+CALIBRATION_IMAGES = 256
+WHERE_TO_GET_IT = (
+    "save https://download.pytorch.org/models/vgg16-397923af.pth (torchvision's ImageNet weights, 528 MB) "
+    "in torch hub's cache, or anywhere and give its path"
+)
+# what the readers raise on bytes that are not theirs, the last three from torch.load's restricted unpickler
+_DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError),
+    *(OSError, ValueError, LookupError, AttributeError, TypeError),
+)
 
 
 def perceptual_loss(
@@ -47,28 +61,117 @@ def perceptual_loss(
     return masked_mean(squared / (2 * deviation.square()) + deviation.log(), weight)
 
 
-def build_perceptual(
-    kind: str,
-    images: UInt8[Tensor, "n 3 h w"] | None = None,
-    *,
-    weights: Path | str | None = None,
-    seed: int = 0,
-    steps: int | None = None,
-    progress: Callable[[int, int, float], None] | None = None,
-    device: torch.device | str = "cpu",
-) -> PerceptualFeatures | None:
-    """Frozen, calibrated features of one of ``PERCEPTUAL_KINDS``; None for ``none``.
+class PerceptualFeatures(nn.Module):
+    """A frozen net from images in 0..1 to feature maps; always in evaluation mode, never trained further.
 
-    ``images`` are training images: ``self`` learns from them, and both kinds are calibrated on 256 of them.
-    Without images ``vgg16`` keeps scale 1. ``weights`` is VGG16's file; None looks in torch hub's cache.
+    ``stride`` is the number of pixels per feature location.
     """
-    if kind == "none":
-        return None
-    if kind == "vgg16":
-        features = load_vgg16(weights).to(device)
-        if images is not None:
-            features.calibrate_(images[:CALIBRATION_IMAGES].to(device).float() / 255)
-        return features
-    if images is None:
-        raise ValueError("perceptual features 'self' are learned from the training images: give images")
-    return train_self_features(images, seed=seed, steps=steps, progress=progress, device=device)
+
+    stride: int
+    channels: int
+    scale: Tensor
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(self, features: nn.Sequential, image_mean: tuple[float, ...], image_std: tuple[float, ...]):
+        super().__init__()
+        self.features = features
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("image_mean", torch.tensor(image_mean).view(1, 3, 1, 1))
+        self.register_buffer("image_std", torch.tensor(image_std).view(1, 3, 1, 1))
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c fh fw"]:
+        """Calibrated features, with gradient to the images (never to the weights)."""
+        return self.features((images - self.image_mean) / self.image_std) * self.scale
+
+    @torch.no_grad()
+    def calibrate_(self, images: Float[Tensor, "n 3 h w"]) -> "PerceptualFeatures":
+        """Make the standard deviation of features about their channel means 1 on these few hundred images.
+
+        It is pooled over channels (one number for all), so relations between channels stay.
+        """
+        self.scale.fill_(1.0)
+        count = 0
+        total = square = torch.zeros(self.channels, dtype=torch.float64, device=images.device)
+        for batch in images.split(16):
+            features = self(batch).double()
+            count += features.numel() // self.channels
+            total = total + features.sum(dim=(0, 2, 3))
+            square = square + features.square().sum(dim=(0, 2, 3))
+        deviation = (square / count - (total / count).square()).clamp(min=0).mean().sqrt().item()
+        if not 1e-8 < deviation < float("inf"):
+            raise ValueError(
+                f"the perceptual features do not vary over {len(images)} calibration images (standard "
+                f"deviation {deviation:g}); give images that differ, or check the weights"
+            )
+        self.scale.fill_(1.0 / deviation)
+        return self
+
+    def train(self, mode: bool = True) -> "PerceptualFeatures":
+        """Stay in evaluation mode, whatever the model around it does."""
+        return super().train(False)
+
+
+class Vgg16Features(PerceptualFeatures):
+    """relu3_3 of VGG16: 256 channels at a quarter of the resolution."""
+
+    stride, channels = 4, 256
+
+    def __init__(self):
+        layers: list[nn.Module] = []
+        channels = 3
+        for width in (64, 64, None, 128, 128, None, 256, 256, 256):
+            if width is None:
+                layers.append(nn.MaxPool2d(2))
+            else:
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+                channels = width
+        super().__init__(nn.Sequential(*layers), (0.485, 0.456, 0.406), (0.229, 0.224, 0.225))  # ImageNet's
+
+
+def load_vgg16(path: Path | str | None = None) -> Vgg16Features:
+    """VGG16's first seven convolutions from .npz, .safetensors or .pth; None looks in torch hub's cache.
+
+    Keys beyond relu3_3 are ignored. A ``.pth`` is read with ``weights_only=True``, so it cannot run code.
+    """
+    if path is None:
+        folder = Path(torch.hub.get_dir()) / "checkpoints"
+        cached = sorted(folder.glob("vgg16-*.pth"))
+        if not cached:
+            raise ValueError(f"no vgg16-*.pth in torch hub's cache {folder}: {WHERE_TO_GET_IT}")
+        path = cached[0]
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise ValueError(f"no VGG16 weights at {path}: {WHERE_TO_GET_IT}")
+    found = _read_weights(path)
+    net = Vgg16Features()
+    expected = net.features.state_dict(prefix="features.")
+    try:
+        if not isinstance(found, dict):
+            raise ValueError("it holds no named weights")
+        named = {name: value for name, value in found.items() if name in expected}
+        check_fit(named, expected)
+    except ValueError as problem:
+        raise ValueError(f"{path} is not torchvision's VGG16 ({problem}): {WHERE_TO_GET_IT}") from problem
+    net.load_state_dict({**net.state_dict(), **{name: value.float() for name, value in named.items()}})
+    return net
+
+
+def _read_weights(path: Path) -> object:
+    try:
+        match path.suffix.lower():
+            case ".npz":
+                with np.load(path, allow_pickle=False) as archive:
+                    return {name: torch.from_numpy(archive[name]) for name in archive.files}
+            case ".safetensors":
+                return read_tensors(path)
+            case ".pth" | ".pt":
+                check_pickle(path)
+                weights = torch.load(path, map_location="cpu", weights_only=True)
+                require_plain(weights if isinstance(weights, dict) else {}, path)
+                return weights
+    except _DAMAGED as problem:
+        raise ValueError(f"VGG16 weights in {path} cannot be read ({problem})") from problem
+    raise ValueError(f"VGG16 weights in {path}: expected a .npz, .safetensors or .pth file")

@@ -80,12 +80,9 @@ def masked_mean(
     return torch.where(weight > 0, value * weight, 0.0).sum() / torch.where(total > 0, total, 1.0)
 
 
-def bounded_sigma(sigma: Float[Tensor, "*shape"], floor: float = SIGMA_FLOOR) -> Float[Tensor, "*shape"]:
-    """``sqrt(sigma^2 + floor^2)``: never below the floor, where a softplus could reach 0, and with a
-    gradient.
-    """
-    sigma = at_least_float32(sigma)
-    return (sigma.square() + floor**2).sqrt()
+def bounded_sigma(sigma: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Never below the floor, where a softplus could reach 0, and with a gradient."""
+    return (at_least_float32(sigma).square() + SIGMA_FLOOR**2).sqrt()
 
 
 def at_least_float32(value: Tensor) -> Tensor:

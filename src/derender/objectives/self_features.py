@@ -16,18 +16,18 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor, nn
 
 from derender.objectives.loocc import nt_xent
-from derender.objectives.perceptual_features import CALIBRATION_IMAGES, PerceptualFeatures
+from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeatures
 from derender.storage.bounded import parse_json
 from derender.storage.tensors import read_described, write_tensors
 
 DEFAULT_WIDTHS = (16, 32, 64)
-DEFAULT_STEPS = 600
+KIND = "self"  # in a file's metadata
 
 
 class SelfFeatures(PerceptualFeatures):
     """Convolutions, ReLUs and average pooling: ``widths[-1]`` channels at a quarter of the resolution."""
 
-    kind, stride = "self", 4
+    stride = 4
 
     def __init__(self, widths: tuple[int, int, int] = DEFAULT_WIDTHS):
         super().__init__(trunk(widths, normalised=False), (0.5, 0.5, 0.5), (0.25, 0.25, 0.25))
@@ -36,7 +36,7 @@ class SelfFeatures(PerceptualFeatures):
 
     def save(self, path: Path | str) -> None:
         """Write weights, scale and widths to one safetensors file."""
-        write_tensors(self.state_dict(), path, {"kind": self.kind, "widths": json.dumps(self.widths)})
+        write_tensors(self.state_dict(), path, {"kind": KIND, "widths": json.dumps(self.widths)})
 
 
 def load_self_features(path: Path | str) -> SelfFeatures:
@@ -45,7 +45,7 @@ def load_self_features(path: Path | str) -> SelfFeatures:
         tensors, metadata = read_described(path)
     except (ValueError, OSError) as problem:
         raise ValueError(f"the perceptual features in {path} cannot be read ({problem})") from problem
-    if metadata.get("kind") != SelfFeatures.kind or "widths" not in metadata:
+    if metadata.get("kind") != KIND or "widths" not in metadata:
         raise ValueError(f"{path} holds no self-trained perceptual features; something else wrote it")
     try:
         net = SelfFeatures(parse_json(metadata["widths"], tuple[int, int, int]))
@@ -116,7 +116,7 @@ def train_self_features(
     images: UInt8[Tensor, "n 3 h w"],
     *,
     seed: int,
-    steps: int | None = None,
+    steps: int,
     progress: Callable[[int, int, float], None] | None = None,
     device: torch.device | str = "cpu",
     settings: SelfTraining = SelfTraining(),
@@ -128,7 +128,6 @@ def train_self_features(
     """
     if len(images) < 2:
         raise ValueError(f"self-trained perceptual features need at least 2 images, got {len(images)}")
-    steps = DEFAULT_STEPS if steps is None else steps
     if steps < 1:
         raise ValueError(f"training perceptual features needs at least 1 step, got {steps}")
     generator = Generator().manual_seed(seed)

@@ -53,7 +53,9 @@ class Batches:
 
     def sample(self) -> UInt8[Tensor, "n 3 h w"]:
         """All training images; of a mapped set at most ``SAMPLED``, evenly spread, in memory."""
-        return self.images if self.rows is None else torch.from_numpy(_spread(self.images.numpy(), self.rows))
+        if self.rows is None:
+            return self.images
+        return torch.from_numpy(some_of(self.images.numpy(), self.rows, mapped=True))
 
     def at(self, position: int, ranks: Ranks = ALONE) -> Float[Tensor, "b 3 h w"]:
         """The batch at a position of the run, from 0 on, in 0..1; of several ``ranks`` each gets its rows."""
@@ -100,13 +102,11 @@ def batches_of(
     return Batches(lying, *how, rows if stay else None, config.reframed, config.reframe)
 
 
-def some_of(images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"]) -> np.ndarray:
-    """These images; of a mapped set at most ``SAMPLED``, evenly spread: (m, 3, H, W) in memory."""
-    return _spread(images, rows) if isinstance(images, np.memmap) else np.ascontiguousarray(images[rows])
-
-
-def _spread(images: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    if len(rows) > SAMPLED:
+def some_of(
+    images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"], *, mapped: bool
+) -> UInt8[np.ndarray, "m 3 h w"]:
+    """These images in memory; of a mapped set at most ``SAMPLED``, evenly spread."""
+    if mapped and len(rows) > SAMPLED:
         rows = rows[np.linspace(0, len(rows) - 1, SAMPLED).astype(np.int64)]
     return np.ascontiguousarray(images[rows])
 

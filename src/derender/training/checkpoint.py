@@ -65,11 +65,7 @@ def save_checkpoint(
 ) -> None:  # fmt: skip
     """Write a checkpoint, read it back, put it in place of ``folder``; the old one becomes ``previous``."""
     kept = optimiser.state_dict()
-    moments = {
-        f"{index}.{name}": value
-        for index, entries in kept["state"].items()
-        for name, value in entries.items()
-    }
+    moments = {f"{i}.{name}": value for i, row in kept["state"].items() for name, value in row.items()}
     with atomic_folder(folder, previous=previous) as temporary:
         for name, tensors in ((WEIGHTS_FILE, model.state_dict()), (OPTIMISER_FILE, moments)):
             content = save({key: value.detach().cpu().contiguous() for key, value in tensors.items()})

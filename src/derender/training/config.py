@@ -8,6 +8,8 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import reduce
+from operator import getitem
 from reprlib import Repr
 from typing import Any, Literal, TypeVar
 
@@ -191,12 +193,6 @@ _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = 200  # a few lines of YAML can stand for gigabytes of text
 
 
-LIGHT_ROBUST = {
-    "pictures": 6_000, "photographs": True, "gradients": True, "directions": 192, "shrinkage": 0.2,
-    "evenness": 0.3,
-}  # fmt: skip
-"""Changes of whitening for identity in any light: chosen on half of the people of Extended Yale B."""
-
 _PRESET_CHANGES: dict[str, dict[str, Any]] = {
     "paper": {
         "objective": {
@@ -206,7 +202,12 @@ _PRESET_CHANGES: dict[str, dict[str, Any]] = {
         "whitening": {"pictures": 0},
         "brightness": False,
     },
-    "faces": {"whitening": LIGHT_ROBUST},
+    "faces": {
+        "whitening": {  # for identity in any light: chosen on half of the people of Extended Yale B
+            "pictures": 6_000, "photographs": True, "gradients": True, "directions": 192, "shrinkage": 0.2,
+            "evenness": 0.3,
+        },
+    },
     "cats": {},
     "cars": {
         "batch_size": 256,
@@ -260,8 +261,8 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
 
 def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:
     """The same kind of configuration with changes as in ``resolve``."""
-    leaves = settings_by_name(config.model_dump(mode="json"))
-    changes: list[tuple[str, Any]] = []
+    tree = config.model_dump(mode="json")
+    names, changes = settings_by_name(tree), []
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not key:
@@ -269,14 +270,8 @@ def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any)
         changes.append((key.strip(), _read_value(text)))
     changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
     for key, value in changes:
-        leaves[_full_key(key, leaves)] = value
-    tree: dict[str, Any] = {}
-    for key, value in leaves.items():
-        *parents, last = key.split(".")
-        part = tree
-        for parent in parents:
-            part = part.setdefault(parent, {})
-        part[last] = value
+        *parents, last = _full_key(key, names).split(".")
+        reduce(getitem, parents, tree)[last] = value
     return config_from_tree(tree, type(config))
 
 

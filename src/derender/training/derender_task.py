@@ -15,9 +15,7 @@ from torch import Generator, Tensor, nn
 from derender.data import ImageSet, split_indices
 from derender.model import Derenderer, load
 from derender.networks.factors import GEOMETRY_START
-from derender.objectives import load_vgg16
-from derender.objectives.perceptual import build_perceptual
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeatures, load_vgg16
 from derender.objectives.self_features import load_self_features, train_self_features
 from derender.postprocess import Features
 from derender.postprocess.whitening import Whitening
@@ -65,7 +63,8 @@ def _add_features(
 ) -> None:
     """Estimate a trained model's features and held-out errors, and save both with it."""
     split = split_indices(images.files, config.split, seed=config.seed)
-    some = torch.from_numpy(some_of(images.images, split.train))
+    mapped = isinstance(images.images, np.memmap)
+    some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
     told = partial(Progress, "features")
     model = make_features(
         model, some, config.features, seed=config.seed, progress=lambda *done: report(told(*done))
@@ -185,8 +184,9 @@ def perceptual_of(
             run.perceptual, images, config.seed, objective.self_features_steps, progress
         )
     else:
-        seen = images if objective.perceptual_rescaled else None
-        features = build_perceptual("vgg16", seen, weights=objective.vgg16_path, device=images.device)
-    if config.channels_last and features is not None:
+        features = load_vgg16(objective.vgg16_path).to(images.device)
+        if objective.perceptual_rescaled:
+            features.calibrate_(images[:CALIBRATION_IMAGES].float() / 255)
+    if config.channels_last:
         features = features.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     return features

@@ -10,9 +10,10 @@ as the model predicts them. Leaves out the confidence net, which stays.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -48,10 +49,15 @@ class StudentSettings(Settings):
     batch_size: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=4e-4, gt=0)
 
-    def plan(self, count: int) -> tuple[int, int]:
-        """Images of a batch and number of batches, out of ``count`` images."""
+    def learn(
+        self, optimiser: torch.optim.Optimizer, loss: Callable[[Tensor], Tensor], count: int,
+        generator: Generator, report: Progress, **how: Any,
+    ) -> None:  # fmt: skip
+        """Minimise a loss of rows of ``count`` images by `one_cycle`."""
         batch = min(self.batch_size, count)
-        return batch, math.ceil(self.images / batch)
+        steps = math.ceil(self.images / batch)
+        for step, _ in one_cycle(optimiser, loss, count, batch, steps, generator, **how):
+            report(min(step * batch, self.images), self.images)
 
     def check(self, student: nn.Module, what: str) -> None:
         """Weights that are NaN or infinite are an error."""
@@ -205,9 +211,7 @@ def _learn(
             total = total + settings.picture_weight * error / _NOISE
         return total
 
-    batch, steps = settings.plan(len(images))
-    for step, _ in one_cycle(optimiser, loss, len(images), batch, steps, generator, warm_up=0.05):
-        report(min(step * batch, settings.images), settings.images)
+    settings.learn(optimiser, loss, len(images), generator, report, warm_up=0.05)
     student.requires_grad_(False).eval()
 
 
@@ -267,16 +271,14 @@ class SceneUnit:
     @torch.no_grad()
     def __init__(self, model: Derenderer, fitted: Scene):
         self.able: dict[str, Bool[Tensor, " k"]] = {}
+        self.deviation: dict[str, Tensor] = {}
         for factor in model.factors:
+            value = fitted.parameters[factor.parameter]
+            self.deviation[factor.parameter] = _mean_deviation(value, factor.numbers)
             if not factor.mirrored:
-                value = fitted.parameters[factor.parameter][:1]
-                ends = (torch.full_like(value, end) for end in (-1.0, 1.0))
+                ends = (torch.full_like(value[:1], end) for end in (-1.0, 1.0))
                 least, most = (factor.to_parameter(end, model.settings.ranges) for end in ends)
                 self.able[factor.parameter] = (least != most)[0]
-        self.deviation = {
-            row.parameter: _mean_deviation(fitted.parameters[row.parameter], row.numbers)
-            for row in model.factors
-        }
         self.slope = _mean_deviation(_slopes(fitted.depth)).mean()
 
     def gaps(self, predicted: Scene, target: Scene) -> dict[str, Tensor]:

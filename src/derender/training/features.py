@@ -4,12 +4,8 @@ Whitening: how other factors move a model's activations, measured on its own ren
 albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
 encoded again, several times. Mirror images count as views, too, for the object is symmetric. For each vector
 factor everything but that factor is changed: maps are another image's. Leaves out changing one map beside the
-other, which brought nothing (lab/log.md).
-
-Brightness: the prior that shares it between albedo and light (scene/brightness.py).
-
-Fitting: a morphable model of the depths and albedos that the model predicts. The optimisation itself happens
-when a model is used (postprocess/fitting.py).
+other, which brought nothing (lab/log.md). Brightness: the prior that shares it between albedo and light.
+Fitting: a morphable model of the predicted depths and albedos, within which postprocess/fitting.py optimises.
 """
 
 import math
@@ -145,13 +141,14 @@ def fit_whitening(
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     if describe is None:
         size = size or model.settings.network.code_size
+    shrinkage, power = settings.shrinkage, settings.vector_power
     projections = {
-        name: fit_projection(scatter, settings.directions, settings.shrinkage, size, settings.evenness)
+        name: fit_projection(scatter, settings.directions, shrinkage, size, settings.evenness)
         for name, scatter in mirrored.items()
+    } | {
+        name: fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
+        for name, scatter in alone.items()
     }
-    for name, scatter in alone.items():
-        kept, power = len(scatter.mean), settings.vector_power
-        projections[name] = fit_projection(scatter, kept, settings.shrinkage, power=power)
     return Whitening(projections, mirrored=mirrored if settings.mirrored else ()).to(model.device)
 
 

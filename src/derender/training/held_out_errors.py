@@ -104,19 +104,19 @@ def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
     if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):
         return ""
-    found = {}
+    found = []
     for name in bundled_models():
         known, model = read_errors(model_folder(name)), load(name)
         if known is not None and model.image_size == images.shape[-1]:
-            found[name] = float(np.median(reconstruction_percentile(model, images[odd], known)))
-    best = min(found, key=lambda name: found[name], default="")
+            found.append((float(np.median(reconstruction_percentile(model, images[odd], known))), name))
     line = (
         f"{len(odd):,} of {len(percentiles):,} images are reconstructed worse than {OUTLIER_PERCENTILE:g} % "
         "of those this model was validated on: another kind of object, or another crop "
         "(derender align, --frame)"
     )
-    if best and found[best] < FITTING:
-        return f"{line}; {best} fits better (worse than {found[best]:.0f} % of its own): try --model {best}"
+    worse, best = min(found, default=(100.0, ""))
+    if worse < FITTING:
+        return f"{line}; {best} fits better (worse than {worse:.0f} % of its own): try --model {best}"
     return line
 
 
@@ -132,7 +132,7 @@ def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors
 
 
 def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErrors | None:
-    """Save the errors of held-out images with the model in ``folder``; None of fewer than 20."""
+    """Save the errors of held-out images with the model in ``folder``; None of fewer than 20 it renders."""
     try:
         errors = errors_of(load(folder, device=held_out.device), held_out)
     except NotFinite:

@@ -9,7 +9,8 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from itertools import groupby
+from functools import partial
+from itertools import count, groupby, takewhile
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,7 @@ from derender.training.distributed import open_fabric, ranks_of
 from derender.training.process import (
     TrainingInterrupted,
     deterministic_algorithms,
+    evaluating,
     freed_memory_kept,
     locked,
     stop_on_signal,
@@ -99,12 +101,11 @@ class _Run:
         self.model: Any = task.build().to(fabric.device)
         if config.channels_last:
             self.model.to(memory_format=torch.channels_last)
-
-        def prepared(done: int, total: int) -> None:
-            self.report(Progress("perceptual", done, total))
-
+        told = partial(Progress, "perceptual")
         with fabric.rank_zero_first():
-            step = task.step_module(self.model, self.folder, batches.sample(), prepared)
+            step = task.step_module(
+                self.model, self.folder, batches.sample(), lambda *counts: self.report(told(*counts))
+            )
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
         self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True)
@@ -265,32 +266,27 @@ class _Run:
     def held_out_losses(self) -> dict[str, float]:
         """Mean losses over held-out images, shared by the ranks; "loss" sums those the task judges by."""
         sums: dict[str, float] = defaultdict(float)
-        count, size = 0, self.config.batch_size
-        self.module.eval()
-        for position, (batch, rows) in enumerate(
-            zip(self.held_out.split(size), self.held_rows.split(size), strict=True)
-        ):
-            if len(batch) < 2 and count:
-                break
-            count += len(batch)
-            if position % self.ranks.count != self.ranks.rank:
-                continue
-            noise = random_stream(self.config.seed, "perturb", position)
-            result = compute_step(self.module, batch.float() / 255, noise, self.precision, rows=rows)
-            for name, value in _on_host(result.terms).items():
-                sums[name] += value * len(batch)
-        self.module.train()
-        means = {name: value / max(count, 1) for name, value in self.ranks.sum(sums).items()}
+        seen, size = 0, self.config.batch_size
+        batches = zip(self.held_out.split(size), self.held_rows.split(size), strict=True)
+        with evaluating(self.module):
+            for position, (batch, rows) in enumerate(batches):
+                if len(batch) < 2 and seen:
+                    break
+                seen += len(batch)
+                if position % self.ranks.count == self.ranks.rank:
+                    noise = random_stream(self.config.seed, "perturb", position)
+                    result = compute_step(self.module, batch.float() / 255, noise, self.precision, rows=rows)
+                    for name, value in _on_host(result.terms).items():
+                        sums[name] += value * len(batch)
+        means = {name: value / max(seen, 1) for name, value in self.ranks.sum(sums).items()}
         return {"loss": sum(means[name] for name in means if name not in self.task.outside_loss), **means}
 
     def draw(self) -> None:
         """Write a sheet of decomposed held-out images."""
         if self.sample_sheet is None or not len(self.held_out) or not self.ranks.first:
             return
-        self.model.eval()
-        with torch.no_grad():
+        with evaluating(self.model), torch.no_grad():
             sheet = self.sample_sheet(self.model, self.held_out[:SAMPLE_COUNT].float() / 255)
-        self.model.train()
         with atomic_file(self.folder.samples / f"{self.state.images:09d}.png") as temporary:
             sheet.save(temporary, format="PNG")
 
@@ -365,9 +361,5 @@ def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
 
 def kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
     """As ``passed``, and at halves of the first interval, so that an early collapse leaves a good state."""
-    early = interval // 2
-    while early >= FIRST_KEPT_IMAGES:
-        if before < early <= now:
-            return True
-        early //= 2
-    return passed(before, now, interval, ended=ended)
+    halves = takewhile(FIRST_KEPT_IMAGES.__le__, (interval // 2**half for half in count(1)))
+    return passed(before, now, interval, ended=ended) or any(before < early <= now for early in halves)

@@ -206,6 +206,5 @@ def environment(device: str) -> dict[str, Any]:
 
 def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
     """The data of a run, for its environment.json."""
-    counts: dict[str, Any] = {"pictures": images, "train": split.train, "validation": split.validation}
-    counts |= {"test": split.test, "skipped": images.skipped, "duplicates": images.duplicates}
-    return {"layout": images.layout, **{name: len(values) for name, values in counts.items()}}
+    parts = {"pictures": images, **vars(split), "skipped": images.skipped, "duplicates": images.duplicates}
+    return {"layout": images.layout, **{name: len(values) for name, values in parts.items()}}

@@ -17,8 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from derender.model import Derenderer
 from derender.networks.decoders import Confidence
 from derender.objectives.loocc import loocc_loss
-from derender.objectives.perceptual import perceptual_loss
-from derender.objectives.perceptual_features import PerceptualFeatures
+from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
 from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
 from derender.render import Rendering
 from derender.scene import Scene
@@ -69,17 +68,18 @@ def training_step(
         ranks: those that share the batch; the mean of their terms is the batch's.
         chunks: number of chunks in which networks and renderer work, to save memory.
     """
-    count = images.shape[0]
+    count, encode = images.shape[0], lambda rows: model.encode(rows["images"])
     with precision():
-        codes = in_chunks(lambda rows: model.encode(rows["images"]), {"images": images}, chunks)
+        codes = in_chunks(encode, {"images": images}, chunks)
         shared = share_codes(codes, [f.name for f in model.factors if f.mirrored], own, ranks)
         scene = Scene.from_parameters(
             in_chunks(lambda rows: dict(model.decode(dict(rows)).parameters), shared, chunks)
         )
         sigmas: dict[str, Tensor] = {}
         if objective.confidence:
-            seen = {"images": images}
-            sigmas = in_chunks(lambda rows: vars(model.confidence(rows["images"])), seen, chunks)
+            sigmas = in_chunks(
+                lambda rows: vars(model.confidence(rows["images"])), {"images": images}, chunks
+            )
     scenes = [scene, model.mirror(scene)]
     left_out = None
     if objective.loocc != "none":
@@ -113,9 +113,9 @@ def training_step(
     if model.renderer.penalty is not None:
         terms["penalty"] = model.renderer.penalty(scene, model.renderer.shading(scene, model.fov_deg))
     if left_out is not None:
-        seen = {"seen": fill_uncovered(image[2 * count :], mask[2 * count :], images)}
+        seen = {"images": fill_uncovered(image[2 * count :], mask[2 * count :], images)}
         with precision():
-            again = in_chunks(lambda rows: model.encode(rows["seen"]), seen, chunks)
+            again = in_chunks(encode, seen, chunks)
         contrast = loocc_loss(
             {name: ranks.gather(code) for name, code in codes.items()},
             {name: ranks.gather(code) for name, code in again.items()},

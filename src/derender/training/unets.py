@@ -10,7 +10,7 @@ Leaves out light and camera, whose encoders stay.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -21,7 +21,7 @@ from torch.nn.functional import affine_grid, grid_sample
 from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
-from derender.objectives.self_features import one_cycle
+from derender.objectives.reconstruction import masked_mean
 from derender.render.renderer import warp
 from derender.training.distillation import MEASURED_IMAGES, StudentSettings
 
@@ -41,9 +41,6 @@ class UNetSettings(StudentSettings):
     code_weight: float = Field(default=0.1, ge=0)
     unet_width: int = Field(default=16, ge=1)
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # of the students alone
-
-
-DEFAULT_UNETS = UNetSettings()
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ class DistilledUNets:
 
 
 def distil_unets(
-    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], settings: UNetSettings = DEFAULT_UNETS, *,
+    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], settings: UNetSettings | None = None, *,
     seed: int = 0, progress: Progress | None = None,
 ) -> DistilledUNets:  # fmt: skip
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
@@ -80,19 +77,20 @@ def distil_unets(
     neither read nor changed. A ValueError are fewer than two images, images of another size, a model that
     lacks a factor, and weights that end as NaN or infinity.
     """
+    settings = settings or UNetSettings()
     if len(images) < 2 or images.shape[-1] != model.image_size:
         raise ValueError(
             f"U-Nets need 2 images or more of {model.image_size} pixels to learn from, got {len(images)} of "
             f"{images.shape[-1]}"
         )
-    lacking = [name for name in PIXEL_CHANNELS if name not in model.nets]
-    if lacking:
-        raise ValueError(f"the model has no {lacking[0]}: U-Nets learn the paper's factors only")
+    for name in PIXEL_CHANNELS:
+        if name not in model.nets:
+            raise ValueError(f"the model has no {name}: U-Nets learn the paper's factors only")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         student = _with_unets(model, settings.unet_width)
-        widths = {name: encoder.widths for name, encoder in _encoders(student).items()}
-        decoders = {name: UNetDecoder(widths[name], 1, count) for name, count in PIXEL_CHANNELS.items()}
+        encoders = _encoders(student).items()
+        decoders = {name: UNetDecoder(encoder.widths, 1, PIXEL_CHANNELS[name]) for name, encoder in encoders}
         heads = nn.ModuleDict(decoders).to(model.device)
     _learn(model, student, heads, images, settings, Generator().manual_seed(seed), progress)
     settings.check(student, "the U-Nets' training")
@@ -111,10 +109,9 @@ def _with_unets(model: Derenderer, width: int) -> Derenderer:
     return student.to(model.device).requires_grad_(False)
 
 
-def _encoders(model: Derenderer) -> dict[str, UNetEncoder]:
+def _encoders(model: Any) -> dict[str, UNetEncoder]:
     """The U-Nets of geometry and albedo."""
-    encoders = {name: model.nets[name].encoder for name in PIXEL_CHANNELS}
-    return {name: encoder for name, encoder in encoders.items() if isinstance(encoder, UNetEncoder)}
+    return {name: model.nets[name].encoder for name in PIXEL_CHANNELS}
 
 
 def _learn(
@@ -155,12 +152,9 @@ def _learn(
             total = total + settings.code_weight * (difference / scale[name]).square().mean()
         return total
 
-    batch, steps = settings.plan(len(images))
     parts = [alone, joint]  # each is clipped by itself: encoders learn as if there were no decoder over both
-    cycle = one_cycle(optimiser, loss, len(images), batch, steps, generator, warm_up=0.1, clipped=parts)
-    for step, _ in cycle:
-        if progress is not None:
-            progress(min(step * batch, settings.images), settings.images)
+    report = progress or (lambda *_: None)
+    settings.learn(optimiser, loss, len(images), generator, report, warm_up=0.1, clipped=parts)
     learning.eval().requires_grad_(False)
     student.eval()
 
@@ -211,7 +205,7 @@ def masked_error(
     predicted: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Float[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
     """Mean absolute error over channels and the pixels that the mask keeps."""
-    return ((predicted - target).abs().mean(dim=1) * mask).sum() / mask.sum().clamp(min=1)
+    return masked_mean((predicted - target).abs().mean(dim=1), mask)
 
 
 @torch.no_grad()
