@@ -4,7 +4,7 @@ The value that travels through the right half of the program. Leaves out how fea
 baselines/) and every score (evaluation/).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,8 @@ class FeatureTable:
         object.__setattr__(self, "origin", dict(self.origin))
         if not factors:
             raise ValueError("a feature table needs at least one factor")
-        check_names(factors, labels)
+        if twice := set(factors) & set(labels) or {"file"} & {*factors, *labels}:
+            raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
         for kind, columns, shape in (
             ("label", labels, "one value"),
             ("factor", factors, "at least one number"),
@@ -114,9 +115,9 @@ class FeatureTable:
 
     def write(self, path: str | Path) -> Path:
         """Write parquet; at ``path`` stands the old file or the whole new one, never half of it."""
-        from derender.features.parquet import Columns, write_columns
+        from derender.features.parquet import write_tables
 
-        write_columns(Path(path), [Columns(self.files, self.factors, self.labels, self.origin)])
+        write_tables(Path(path), [self])
         return Path(path)
 
     @classmethod
@@ -125,20 +126,9 @@ class FeatureTable:
 
         With ``only``, a factor's name, no other factor is read: much faster where a table is large.
         """
-        from derender.features.parquet import read_columns
+        from derender.features.parquet import read_table
 
-        content = read_columns(Path(path), only)
-        try:
-            return cls(tuple(content.files), content.factors, content.labels, content.origin)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-
-def check_names(factors: Iterable[str], labels: Iterable[str]) -> None:
-    """A column name that is used twice is an error."""
-    twice = set(factors) & set(labels) or {"file"} & {*factors, *labels}
-    if twice:
-        raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
+        return read_table(Path(path), only)
 
 
 def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> None:
