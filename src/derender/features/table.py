@@ -106,10 +106,14 @@ class FeatureTable:
         for name, values in table.factors.items():
             np.add.at(total[name], group, values)
         sizes = np.bincount(group, minlength=len(number))[:, None]
+
+        def constant(column: np.ndarray) -> bool:
+            return np.array_equal(column[first][group], column, equal_nan=column.dtype.kind == "f")
+
         return type(self)(
             tuple("/".join(map(str, key)) for key in number),
             {name: values / sizes for name, values in total.items()},
-            {name: v[first] for name, v in table.labels.items() if _equal(v[first][group], v)},
+            {name: column[first] for name, column in table.labels.items() if constant(column)},
             {**self.origin, "mean_by": list(labels)},
         )
 
@@ -140,8 +144,3 @@ def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> Non
                 f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
                 f"{files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
             )
-
-
-def _equal(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal everywhere, NaN counting as equal to NaN."""
-    return all(x == y or (x != x and y != y) for x, y in zip(a.tolist(), b.tolist(), strict=True))
