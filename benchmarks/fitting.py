@@ -20,19 +20,19 @@ import derender
 from derender.data import ImageSet
 from derender.data.synthetic import faces
 from derender.evaluation import disentangle
-from derender.postprocess import portions
+from derender.postprocess import embedding
 
 MODEL = "rendered-faces-64"
 
 
 def in_turns(work: Callable[[], Any], rounds: int) -> tuple[dict[str, Any], list[Any]]:
     """Processor seconds of both, after a round to warm up, and what both gave last."""
-    seconds: dict[int, list[float]] = {portions.FEW: [], portions.MOST: []}
+    seconds: dict[int, list[float]] = {embedding.FEW: [], embedding.MOST: []}
     results: list[Any] = []
     for number in range(rounds + 1):
         results = []
         for most, found in seconds.items():
-            with patch.object(portions, "MOST", most):
+            with patch.object(embedding, "MOST", most):
                 began = time.process_time()
                 results.append(work())
                 if number or not rounds:

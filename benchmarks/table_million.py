@@ -19,7 +19,8 @@ import pyarrow.parquet as pq
 from clustering_million import BLOCK, block
 from machine import parser, publish
 
-from derender.features.parquet import Columns, write_columns
+from derender.features import FeatureTable
+from derender.features.parquet import write_tables
 
 FACTOR, NEIGHBOURS, QUERIES = "geometry", 10, 200
 
@@ -27,13 +28,13 @@ FACTOR, NEIGHBOURS, QUERIES = "geometry", 10, 200
 def write_table(file: Path, rows: int, dimensions: int = 128) -> None:
     """A table of so many rows, as `derender embed` writes it."""
 
-    def groups() -> Iterator[Columns]:
+    def groups() -> Iterator[FeatureTable]:
         for number, start in enumerate(range(0, rows, BLOCK)):
             features, kinds = block(number, min(BLOCK, rows - start))
             files = tuple(f"{start + row:08d}.jpg" for row in range(len(kinds)))
-            yield Columns(files, {FACTOR: features[:, :dimensions]}, {"kind": kinds}, {})
+            yield FeatureTable(files, {FACTOR: features[:, :dimensions]}, {"kind": kinds})
 
-    write_columns(file, groups())
+    write_tables(file, groups())
 
 
 def factor_of(file: Path) -> Iterator[np.ndarray]:

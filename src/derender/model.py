@@ -27,6 +27,7 @@ from derender.scene.ranges import SceneRanges
 from derender.storage import folder as files
 from derender.storage.places import model_folder
 from derender.storage.sharing import Shareable
+from derender.storage.tensors import write_tensors
 
 
 class Derenderer(EmbeddingModel, Shareable):
@@ -139,15 +140,12 @@ class Derenderer(EmbeddingModel, Shareable):
         )
 
     def write(self, folder: Path) -> None:
-        names = [factor.name for factor in self.factors]
-        files.write_model(folder, names, self.settings.model_dump(mode="json"), self.state_dict())
+        write_tensors(self.state_dict(), folder / files.WEIGHTS_FILE)
+        files.write_config(folder, [factor.name for factor in self.factors], self.settings)
         self.features.save(folder)
 
     def tensors(self) -> dict[str, Tensor]:
         return self.state_dict() | self.features.tensors()
-
-    def description(self) -> str:
-        return self.settings.description()
 
 
 def load(

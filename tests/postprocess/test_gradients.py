@@ -2,7 +2,7 @@
 
 import torch
 
-from derender.postprocess.gradients import CELLS, SCALE, gradient_directions
+from derender.postprocess.embedding import CELLS, SCALE, gradient_directions
 
 
 def images(seed=0, size=64):

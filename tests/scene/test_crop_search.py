@@ -7,9 +7,13 @@ from torch.nn.functional import interpolate
 
 import derender
 from derender.report.viewer.neighbours import rendered_examples
-from derender.scene.crop import WHOLE, Crop, as_bytes, best_crop, candidate_crops, crop_errors
+from derender.scene.crop import WHOLE, Crop, best_crop, candidate_crops, crop_errors
 
 TRUE = Crop(0.7, 0.1, 0.2)
+
+
+def as_bytes(images: torch.Tensor) -> torch.Tensor:
+    return (images * 255).round().to(torch.uint8)
 
 
 @pytest.fixture(scope="module")

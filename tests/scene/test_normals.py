@@ -6,7 +6,6 @@ import pytest
 import torch
 from tests.tolerances import assert_agrees
 from torch import Tensor
-from torch.autograd import gradcheck
 from torch.nn.functional import normalize
 
 from derender.scene.camera import pixel_rays, unproject
@@ -21,13 +20,8 @@ def plane(normal: Tensor, height: int, width: int) -> Tensor:
     return (normal[2] / (rays @ normal))[None]
 
 
-def test_a_plane_facing_the_camera_has_normal_001():
-    normal = normals_from_depth(torch.full((2, 5, 7), 1.3), FOV_DEG)
-    assert_agrees(normal, torch.tensor([0.0, 0.0, 1.0]).expand(2, 5, 7, 3))
-
-
 @pytest.mark.parametrize(("height", "width"), [(2, 2), (3, 8), (9, 4)])
-@pytest.mark.parametrize("tilt", [(0.5, 0.0), (0.0, -1.0), (1.3, 0.4)])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.5, 0.0), (0.0, -1.0), (1.3, 0.4)])
 def test_exact_on_planes_up_to_the_border(height, width, tilt):
     expected = normalize(torch.tensor([math.tan(tilt[0]), math.tan(tilt[1]), 1.0]).double(), dim=0)
     normal = normals_from_depth(plane(expected, height, width), FOV_DEG)
@@ -45,12 +39,6 @@ def test_equals_the_cross_product_of_differences(generator):
     assert_agrees(normals_from_depth(depth, FOV_DEG)[:, 0, 0], normalize(corner, dim=-1))
     corner = torch.linalg.cross(points[:, -1, -1] - points[:, -1, -2], points[:, -1, -1] - points[:, -2, -1])
     assert_agrees(normals_from_depth(depth, FOV_DEG)[:, -1, -1], normalize(corner, dim=-1))
-
-
-@pytest.mark.parametrize(("height", "width"), [(2, 2), (4, 3)])
-def test_gradients(height, width, generator):
-    depth = (0.9 + torch.rand(2, height, width, generator=generator, dtype=torch.float64)).requires_grad_()
-    assert gradcheck(lambda d: normals_from_depth(d, 40.0), (depth,))
 
 
 def test_a_single_row_is_an_error():

@@ -11,7 +11,6 @@ from huggingface_hub.errors import HFValidationError, LocalTokenNotFoundError
 
 import derender
 from derender.model import Derenderer
-from derender.storage import hub
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, read_errors, write_errors
 
@@ -59,7 +58,7 @@ class FakeHub:
 @pytest.fixture
 def fake(tmp_path, monkeypatch) -> FakeHub:
     made = FakeHub(tmp_path / "hub")
-    monkeypatch.setattr(hub, "client", lambda token: made)
+    monkeypatch.setattr(huggingface_hub, "HfApi", lambda token: made)
     monkeypatch.setattr(huggingface_hub, "snapshot_download", made.snapshot_download)
     return made
 
@@ -112,7 +111,7 @@ def test_what_the_hub_refuses_is_one_sentence(model, fake, monkeypatch):
     fake.fails = LocalTokenNotFoundError("Token is required")
     with pytest.raises(PermissionError, match="log in with 'hf auth login'"):
         model.push_to_hub("a/b", **MINE)
-    nowhere = huggingface_hub.HfApi(endpoint="http://127.0.0.1:9", token="x")
-    monkeypatch.setattr(hub, "client", lambda token: nowhere)
+    nowhere = huggingface_hub.hf_api.HfApi(endpoint="http://127.0.0.1:9", token="x")
+    monkeypatch.setattr(huggingface_hub, "HfApi", lambda token: nowhere)
     with pytest.raises(ConnectionError, match=r"cannot be reached .* model.save_pretrained writes the same"):
         model.push_to_hub("me/faces", **MINE)

@@ -160,7 +160,7 @@ def test_views_that_keep_the_images_own_pixels(plain, images):
 
 
 def test_gradients_beside_activations_are_kept_with_the_model(tmp_path, monkeypatch):
-    monkeypatch.setattr("derender.postprocess.gradients.CELLS", 4)
+    monkeypatch.setattr("derender.postprocess.embedding.CELLS", 4)
     model = derender.Derenderer.from_preset("small", seed=0, image_size=32)
     pixels = torch.from_numpy(faces.generate(24, image_size=32, seed=5).images).float() / 255
     settings = WhiteningSettings(pictures=24, views=2, gradients=True, photographs=True)

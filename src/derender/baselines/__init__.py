@@ -30,10 +30,9 @@ CONTROLS = ("pixels", "pca", "gradientfaces", "hog", "lbp", "noise")
 BASELINES = (*NETWORKS, *CONTROLS)
 TRAINED = tuple(name for name in NETWORKS if name not in ("dinov2", "untrained"))
 _HOME = {
-    **dict.fromkeys(("baseline_config", "image_size_of", "load_baseline"), "model"),
-    **dict.fromkeys(("read_any_config", "stored_config"), "model"),
-    "control_features": "controls",
-}
+    "control_features": "controls", "baseline_config": "model", "image_size_of": "model",
+    "load_baseline": "model", "read_any_config": "model", "stored_config": "model",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -12,7 +12,7 @@ replaced by places of the batch.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int64
@@ -70,14 +70,10 @@ class Autoencoder(base.LoopModel):
         self.decoder = MapDecoder(settings.network, 3)
 
     def reconstruct(self, images: base.Images) -> base.Images:
-        """Images through the code, in 0..1."""
         return self.decoder(self.encoder(images)).float().tanh() / 2 + 0.5
 
     def describe(self, images: base.Images) -> base.Features:
         return {"code": self.encoder(images)}
-
-    def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
-        return {"input": images, "reconstruction": self.reconstruct(images)}
 
     def losses(self, images: base.Images, run: base.LossInputs) -> dict[str, Tensor]:
         """Mean squared error in 0..1, and beside it L1."""
@@ -120,9 +116,8 @@ class BetaVae(base.LoopModel):
     def describe(self, images: base.Images) -> base.Features:
         return {"mean": self.posterior(images)[0]}
 
-    def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
-        again = self.decoder(self.posterior(images)[0]).float().sigmoid()
-        return {"input": images, "reconstruction": again}
+    def reconstruct(self, images: base.Images) -> base.Images:
+        return self.decoder(self.posterior(images)[0]).float().sigmoid()
 
     def losses(self, images: base.Images, run: base.LossInputs) -> dict[str, Tensor]:
         """Bernoulli likelihood and weighted divergence, both per colour value; beside them L1, ``active``.
@@ -229,9 +224,8 @@ class Vqvae(base.LoopModel):
         share = share.scatter_add(1, chosen, torch.ones_like(chosen, dtype=share.dtype)) / chosen.shape[1]
         return {"pooled": entries.mean(dim=(2, 3)), "map": entries.flatten(1), "histogram": share}
 
-    def shown(self, images: base.Images, config: Any) -> dict[str, base.Images]:
-        again = self.decode(self.quantise(self.encode(images))[0]).clamp(0, 1)
-        return {"input": images, "reconstruction": again}
+    def reconstruct(self, images: base.Images) -> base.Images:
+        return self.decode(self.quantise(self.encode(images))[0]).clamp(0, 1)
 
     def losses(self, images: base.Images, run: base.LossInputs) -> dict[str, Tensor]:
         """Squared error in -1..1, codebook and commitment terms; beside them L1 in 0..1 and ``codes_used``.

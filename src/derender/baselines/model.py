@@ -18,20 +18,18 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import ValidationError
 from torch import Generator, Tensor, nn
 
 from derender.baselines import network_type
 from derender.data import ImageSet, check_images, split_indices
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
-from derender.storage.folder import FORMAT, saved_config
+from derender.storage.folder import FORMAT, naming_damage, read_weights, saved_config
 from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE, require_known
-from derender.storage.tensors import read_tensors, write_tensors
+from derender.storage.tensors import write_tensors
 from derender.training import config as configs
 from derender.training import run_folder
 from derender.training import task as loop
-from derender.training.checkpoint import fit_weights
 from derender.training.loop import train_task
 from derender.training.watch import FiniteWatch
 
@@ -128,30 +126,19 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     """The baseline saved in a run folder or a model folder, in evaluation mode, without gradient.
 
     ``name`` says which baseline it has to be; None accepts any. A FileNotFoundError: there is no such folder;
-    a ValueError: it is a pickle, damaged, of another architecture, another baseline, or none.
+    a ValueError: it is a pickle, damaged, another baseline, or none.
     """
     folder = _folder_of(Path(source))
-    config, file = saved_config(folder), folder / WEIGHTS_FILE
+    config = saved_config(folder)
     if "baseline" not in config:
         raise ValueError(f"{folder} holds a derender model and no baseline: leave the baseline's name out")
     stored = str(config["baseline"])
     if name not in (None, stored):
         raise ValueError(f"{folder} holds the baseline {stored!r}, asked for {name}")
     kind = network_type(stored)
-    try:
-        model: BaselineModel = kind(kind.settings_type.model_validate(config["settings"]))
-    except ValidationError as error:
-        first = error.errors()[0]
-        setting = f"setting {'.'.join(map(str, first['loc']))!r}: {first['msg']}"
-        raise ValueError(f"{folder / CONFIG_FILE}: {setting}; train it again") from error
-    try:
-        weights = read_tensors(file, like=model.state_dict())
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{file} is damaged ({error}): copy or train the model again") from error
-    try:
-        fit_weights(model, weights)
-    except ValueError as error:
-        raise ValueError(f"{file} is of another architecture: {error}") from error
+    with naming_damage(folder):
+        settings = kind.settings_type.model_validate(config["settings"])
+        model: BaselineModel = read_weights(folder, lambda: kind(settings))
     return model.eval().requires_grad_(False)
 
 
@@ -205,9 +192,13 @@ class LoopModel(BaselineModel):
     def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
         """Losses and other numbers (OUTSIDE_LOSS) of a batch in 0..1, by name."""
 
-    @abstractmethod
+    def reconstruct(self, images: Images) -> Images:
+        """Images in 0..1 through the network; only of networks that make images again."""
+        raise NotImplementedError(f"{self.name} makes no images")
+
     def shown(self, images: Images, config: Any) -> dict[str, Images]:
         """Images for a sample sheet of a run, by column: the input and the network's output."""
+        return {"input": images, "reconstruction": self.reconstruct(images)}
 
     @classmethod
     def train_into(

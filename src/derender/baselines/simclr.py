@@ -174,9 +174,8 @@ class Simclr(LoopModel):
 
     @classmethod
     def build(cls, config: SimclrConfig) -> "Simclr":
-        model = cls(config.model)
-        views_of(config, torch.device("cpu"))
-        return model
+        views_of(config, torch.device("cpu"))  # a model that is missing is an error before there is a folder
+        return cls(config.model)
 
     @staticmethod
     def prepare(

@@ -41,8 +41,8 @@ from derender.data import (
     quiet_pillow,
 )
 from derender.features.extract import as_batch, evaluating, factor_codes
-from derender.features.parquet import Columns, factor_column, factor_values
-from derender.features.table import check_finite
+from derender.features.parquet import factor_column, factor_values
+from derender.features.table import FeatureTable, check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured, write_whole
 from derender.storage.bounded import parse_json, read_json
 
@@ -61,14 +61,9 @@ def embedded_block(model: Any, chunk: Decoded) -> Block:
 
 @contextmanager
 def local_blocks(
-    model: Any,
-    source: Stream | ImageSet,
-    start: int,
-    *,
-    batch_size: int,
-    fit: str = "crop",
+    model: Any, source: Stream | ImageSet, start: int, *, batch_size: int, fit: str = "crop",
     workers: int | None = None,
-) -> Iterator[Iterator[Block]]:
+) -> Iterator[Iterator[Block]]:  # fmt: skip
     """The blocks from sample ``start`` on, computed in this process while a pool decodes ahead."""
     with quiet_pillow(), evaluating(model), ExitStack() as stack:
         if isinstance(source, ImageSet):
@@ -135,15 +130,9 @@ class BlockEmbedder:
 
 @contextmanager
 def ray_blocks(
-    model: Any,
-    stream: Stream,
-    start: int,
-    *,
-    open_stream: OpenStream,
-    batch_size: int,
-    fit: str = "crop",
+    model: Any, stream: Stream, start: int, *, open_stream: OpenStream, batch_size: int, fit: str = "crop",
     workers: int = 2,
-) -> Iterator[Iterator[Block]]:
+) -> Iterator[Iterator[Block]]:  # fmt: skip
     """As ``local_blocks``, with ``workers`` actors of one core each, or of one GPU each for a model on one.
 
     Ray starts an actor anew when its process or machine dies, and gives its block to another. Every machine
@@ -318,7 +307,9 @@ class Parts:
         del table
         pa.default_memory_pool().release_unused()
 
-    def columns(self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None) -> Iterator[Columns]:
+    def tables(
+        self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None
+    ) -> Iterator[FeatureTable]:
         """The finished table, part by part, with its ``origin``.
 
         ``known`` are labels of all images, where they were known beforehand; None: the stream's.
@@ -343,7 +334,7 @@ class Parts:
             else:
                 rows = [json.loads(text) for text in table["labels"].to_pylist()]
                 labels = {name: column_of(name, rows, kinds[name]) for name in names}
-            yield Columns(table["file"].to_pylist(), factors, labels, origin)
+            yield FeatureTable(tuple(table["file"].to_pylist()), factors, labels, origin)
 
     def remove(self) -> None:
         """Delete the folder."""

@@ -6,11 +6,12 @@ stopped run continues from them, and gives the same table, bit for bit: its batc
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,8 +29,8 @@ from derender.data import (
 )
 from derender.features.blocks import PARTS_FORMAT, Parts, Rows, local_blocks, ray_blocks, rows_of
 from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
-from derender.features.parquet import Columns, write_columns
-from derender.features.table import FeatureTable, check_names
+from derender.features.parquet import write_tables
+from derender.features.table import FeatureTable
 from derender.inputs import Progress, as_images, as_model
 from derender.storage.places import model_folder, require_known
 from derender.training.held_out_errors import read_errors, reconstruction_percentile, unlike
@@ -235,24 +236,18 @@ def _finish(
     parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int
 ) -> Embedded:
     """Put the parts together, then delete them."""
-    factors: dict[str, int] = {}
-    labels: list[str] = []
     skipped = (*(images.passed_over if isinstance(images, Stream) else ()), *parts.skipped)
     if not parts.rows:
         parts.remove()
         more = f"; the first is {parts.skipped[0].file!r}: {parts.skipped[0].reason}" if parts.skipped else ""
         raise ValueError(f"no image in {images.source} ({images.layout}) can be read{more}")
     source = images if isinstance(images, ImageSet) else images.table
-    known = None if source is None else table_labels(source)
-
-    def groups() -> Iterator[Columns]:
-        for group in parts.columns(facts, known):
-            check_names(group.factors, group.labels)
-            factors.update({name: values.shape[1] for name, values in group.factors.items()})
-            labels[:] = group.labels
-            yield group
-
-    write_columns(path, groups())
+    tables = parts.tables(facts, None if source is None else table_labels(source))
+    first = next(tables)
+    write_tables(path, chain([first], tables))
     parts.remove()
+    widths = {name: values.shape[1] for name, values in first.factors.items()}
     counts = (len(skipped), skipped[:LISTED_SKIPPED], parts.copies, resumed)
-    return Embedded(path, parts.rows, factors, tuple(labels), facts, *counts, images.source, images.layout)
+    return Embedded(
+        path, parts.rows, widths, tuple(first.labels), facts, *counts, images.source, images.layout
+    )

@@ -29,13 +29,9 @@ def model_fingerprint(model: nn.Module) -> str:
 
 
 def map_batches(
-    function: Callable[[Tensor], T],
-    model: Any,
-    images: np.ndarray,
-    *,
-    batch_size: int,
+    function: Callable[[Tensor], T], model: Any, images: np.ndarray, *, batch_size: int,
     progress: Progress | None = None,
-) -> list[T]:
+) -> list[T]:  # fmt: skip
     """Results of a function of images in 0..1 on the model's device, batch by batch, without gradients.
 
     The model is in evaluation mode meanwhile, and afterwards as it was. Images are (N, 3, H, W), uint8 or
@@ -86,13 +82,9 @@ def embed_images(
 
 
 def embed_image_set(
-    model: Any,
-    images: ImageSet,
-    *,
-    batch_size: int = 256,
-    progress: Progress | None = None,
+    model: Any, images: ImageSet, *, batch_size: int = 256, progress: Progress | None = None,
     origin: Mapping[str, Any] | None = None,
-) -> FeatureTable:
+) -> FeatureTable:  # fmt: skip
     """Run a model's encoders over an image set of its size; labels and the owners' split go into the table.
 
     ``model`` has ``embed(images in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``. Facts in

@@ -57,16 +57,9 @@ class Found:
 
 
 def search(
-    table: FeatureTable | str | Path,
-    like: str | Path,
-    factor: str = "geometry",
-    k: int = 12,
-    *,
-    metric: str = "cosine",
-    model: Any = None,
-    copies: bool = False,
-    device: str = "auto",
-) -> Found:
+    table: FeatureTable | str | Path, like: str | Path, factor: str = "geometry", k: int = 12, *,
+    metric: str = "cosine", model: Any = None, copies: bool = False, device: str = "auto",
+) -> Found:  # fmt: skip
     """The images of a table that are nearest to one image by one factor.
 
     Args:
@@ -127,14 +120,9 @@ def maker_of(table: FeatureTable, model: Any, name: str = "the table", *, device
 
 
 def nearest(
-    table: FeatureTable,
-    query: np.ndarray,
-    factor: str,
-    k: int = 12,
-    *,
-    metric: str = "cosine",
+    table: FeatureTable, query: np.ndarray, factor: str, k: int = 12, *, metric: str = "cosine",
     exclude: Sequence[int] = (),
-) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:  # fmt: skip
     """The ``k`` rows of a table nearest to a (D,) query by one factor, nearest first, and their distances.
 
     Rows in ``exclude``, such as the query's own, are left out. ValueError: the factor or metric is unknown,

@@ -6,19 +6,19 @@ our metadata the list columns are factors and all others labels.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import TypeAdapter
 
 from derender.data import opened_parquet
-from derender.features.table import named
+from derender.features.table import FeatureTable, named
 from derender.storage.atomic import atomic_file
 from derender.storage.bounded import parse_json
 
@@ -26,17 +26,7 @@ FORMAT = 1
 METADATA_KEY = b"derender"
 
 
-@dataclass(frozen=True)
-class Columns:
-    """What stands in a file, not yet checked against each other."""
-
-    files: Sequence[str]
-    factors: Mapping[str, np.ndarray]
-    labels: Mapping[str, np.ndarray]
-    origin: Mapping[str, Any]
-
-
-def write_columns(path: Path, groups: Iterable[Columns]) -> None:
+def write_tables(path: Path, groups: Iterable[FeatureTable]) -> None:
     """Write a table that need never be whole in memory, each of ``groups`` as a row group.
 
     All groups have the same factors, labels and origin. At ``path`` stands the old file or the whole new one,
@@ -61,7 +51,7 @@ def write_columns(path: Path, groups: Iterable[Columns]) -> None:
                 writer.close()
 
 
-def as_arrow(content: Columns) -> pa.Table:
+def as_arrow(content: FeatureTable) -> pa.Table:
     """The columns as they stand in the file, with what describes them."""
     columns: dict[str, pa.Array] = {"file": pa.array(content.files, pa.string())}
     columns |= {name: factor_column(values) for name, values in content.factors.items()}
@@ -85,7 +75,7 @@ def factor_column(values: np.ndarray) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def read_columns(path: Path, only: str | None = None) -> Columns:
+def read_table(path: Path, only: str | None = None) -> FeatureTable:
     """Read a feature table's file, ours or a similar one made elsewhere: all its factors, or ``only`` one."""
     if not path.is_file():
         raise FileNotFoundError(f"no feature table at {path}: make one with 'derender embed --out {path}'")
@@ -110,12 +100,13 @@ def read_columns(path: Path, only: str | None = None) -> Columns:
     for name in (*factors, *labels):
         if name not in others:
             raise ValueError(f"{path} lacks the column {name!r} that its metadata names: make it again")
-    return Columns(
-        [str(file) for file in table.column("file").to_pylist()],
-        {name: factor_values(table.column(name), name, path) for name in factors},
-        {name: _label(table.column(name)) for name in labels},
-        described.get("origin", {}),
-    )
+    values = {name: factor_values(table.column(name), name, path) for name in factors}
+    known = {name: _label(table.column(name)) for name in labels}
+    files = tuple(map(str, table.column("file").to_pylist()))
+    try:
+        return FeatureTable(files, values, known, described.get("origin", {}))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 @contextmanager
@@ -156,10 +147,7 @@ def factor_values(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
     value_type = column.type.value_type
     if not (pa.types.is_floating(value_type) or pa.types.is_integer(value_type)):
         raise ValueError(f"{where} holds {value_type}, expected numbers")
-    if pa.types.is_fixed_size_list(column.type):
-        widths = [column.type.list_size]
-    else:
-        widths = sorted({width for chunk in column.chunks for width in chunk.value_lengths().to_pylist()})
+    widths = sorted(pc.call_function("list_value_length", [column]).unique().to_pylist())
     if len(widths) > 1:
         raise ValueError(f"{where} has rows of different lengths ({widths[0]} to {widths[-1]})")
     parts = [chunk.flatten().to_numpy(zero_copy_only=False).astype(np.float32) for chunk in column.chunks]

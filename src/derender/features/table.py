@@ -4,7 +4,7 @@ The value that travels through the right half of the program. Leaves out how fea
 baselines/) and every score (evaluation/).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,8 @@ class FeatureTable:
         object.__setattr__(self, "origin", dict(self.origin))
         if not factors:
             raise ValueError("a feature table needs at least one factor")
-        check_names(factors, labels)
+        if twice := set(factors) & set(labels) or {"file"} & {*factors, *labels}:
+            raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
         for kind, columns, shape in (
             ("label", labels, "one value"),
             ("factor", factors, "at least one number"),
@@ -105,18 +106,22 @@ class FeatureTable:
         for name, values in table.factors.items():
             np.add.at(total[name], group, values)
         sizes = np.bincount(group, minlength=len(number))[:, None]
+
+        def constant(column: np.ndarray) -> bool:
+            return np.array_equal(column[first][group], column, equal_nan=column.dtype.kind == "f")
+
         return type(self)(
             tuple("/".join(map(str, key)) for key in number),
             {name: values / sizes for name, values in total.items()},
-            {name: v[first] for name, v in table.labels.items() if _equal(v[first][group], v)},
+            {name: column[first] for name, column in table.labels.items() if constant(column)},
             {**self.origin, "mean_by": list(labels)},
         )
 
     def write(self, path: str | Path) -> Path:
         """Write parquet; at ``path`` stands the old file or the whole new one, never half of it."""
-        from derender.features.parquet import Columns, write_columns
+        from derender.features.parquet import write_tables
 
-        write_columns(Path(path), [Columns(self.files, self.factors, self.labels, self.origin)])
+        write_tables(Path(path), [self])
         return Path(path)
 
     @classmethod
@@ -125,20 +130,9 @@ class FeatureTable:
 
         With ``only``, a factor's name, no other factor is read: much faster where a table is large.
         """
-        from derender.features.parquet import read_columns
+        from derender.features.parquet import read_table
 
-        content = read_columns(Path(path), only)
-        try:
-            return cls(tuple(content.files), content.factors, content.labels, content.origin)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-
-def check_names(factors: Iterable[str], labels: Iterable[str]) -> None:
-    """A column name that is used twice is an error."""
-    twice = set(factors) & set(labels) or {"file"} & {*factors, *labels}
-    if twice:
-        raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
+        return read_table(Path(path), only)
 
 
 def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> None:
@@ -150,8 +144,3 @@ def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> Non
                 f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
                 f"{files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
             )
-
-
-def _equal(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal everywhere, NaN counting as equal to NaN."""
-    return all(x == y or (x != x and y != y) for x, y in zip(a.tolist(), b.tolist(), strict=True))

@@ -30,12 +30,9 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
     """
 
     def __init__(
-        self,
-        model: Any = "faces-64",
-        factors: Sequence[str] | None = ("geometry", "albedo"),
-        batch_size: int = 256,
-        device: str | None = None,
-    ):
+        self, model: Any = "faces-64", factors: Sequence[str] | None = ("geometry", "albedo"),
+        batch_size: int = 256, device: str | None = None,
+    ):  # fmt: skip
         self.model, self.factors, self.batch_size, self.device = model, factors, batch_size, device
 
     def fit(self, X: Any = None, y: Any = None) -> "DisentangledFeatures":

@@ -1,27 +1,38 @@
-"""A model's features: encoder activations, and what `Features` makes of them; scenes fitted per image."""
+"""A model's features: encoder activations, and what `Features` makes of them; scenes fitted per image.
+
+Rounding depends on the shape of a batch and on how threads share it, and many steps downhill magnify it. So
+networks see images by fours, one thread a portion, and a scene is the same whatever stands beside it.
+"""
 
 import copy
+import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, conv2d, pad
 
 from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
 from derender.networks.encoders import reduced
 from derender.postprocess.features import Features
 from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
-from derender.postprocess.gradients import gradient_directions
-from derender.postprocess.portions import FEW, by_portions
 from derender.presets import ModelSettings
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior
+from derender.scene.camera import constant
 
+FEW, MOST = 4, 64
+"""Images in one call of a network, and in a portion: large ones take a third less time than fours."""
+CELLS = 32  # of gradient directions along each side
+BLUR_PX, SCALE = 0.75, 0.2  # blur before differences; near the variation of activations (development halves)
+_DARK = 1 / 510  # half a grey level: shorter gradients are noise
 Model = TypeVar("Model", bound="EmbeddingModel")
 
 
@@ -159,5 +170,39 @@ class EmbeddingModel(nn.Module):
             further = list(zip([row.parameter for row in rows], raws, ranged, strict=True))
             return fitting.fit(portion, scene, self.render, steps, further)
 
-        found = Fitted.joined(by_portions(fitted, images), len(images))
+        found = Fitted.joined(_by_portions(fitted, images), len(images))
         return replace(found, scene=self.balanced(found.scene))
+
+
+def gradient_directions(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n directions"]:
+    """Unit vectors (right, down) of the gradient of the mean of colours, averaged over 32x32 cells.
+
+    Slow changes of light turn them little (Gradientfaces, Zhang et al., TIP 2009). Images are in 0..1, at
+    least 32 pixels wide and high. Values lie within -0.2..0.2.
+    """
+    taps = torch.exp(-torch.arange(-3.0, 4.0).square() / (2 * BLUR_PX**2))
+    blur = constant(tuple((taps / taps.sum()).tolist()), images)
+    grey = pad(images.mean(dim=1, keepdim=True), (4, 4, 4, 4), mode="replicate")
+    smooth = conv2d(conv2d(grey, blur.view(1, 1, 1, -1)), blur.view(1, 1, -1, 1))
+    right = smooth[..., 1:-1, 2:] - smooth[..., 1:-1, :-2]
+    down = smooth[..., 2:, 1:-1] - smooth[..., :-2, 1:-1]
+    slope = torch.cat([right, down], dim=1) / 2
+    unit = slope / (slope.square().sum(dim=1, keepdim=True).add(1e-10).sqrt() + _DARK)
+    return SCALE * adaptive_avg_pool2d(unit, CELLS).flatten(1)
+
+
+def _by_portions(function: Callable[[Tensor], Fitted], images: Float[Tensor, "n 3 h w"]) -> list[Fitted]:
+    """Results of portions of images in order, the last one filled up to fours with its last image.
+
+    The function is called by as many threads as torch has, each with one of torch's; on a GPU once, with all.
+    """
+    if images.is_cuda:
+        return [function(images)]
+    missing, threads = -len(images) % FEW, torch.get_num_threads()
+    images = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
+    portions = images.contiguous().split(min(FEW * math.ceil(len(images) / FEW / threads), MOST))
+    try:
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(function, portions))
+    finally:
+        torch.set_num_threads(threads)  # of threads that are yet to come

@@ -18,7 +18,6 @@ from derender.postprocess.morphable import MorphableMaps
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.settings import Settings
-from derender.storage.atomic import atomic_file
 from derender.storage.bounded import parse_json
 from derender.storage.tensors import read_described, write_tensors
 
@@ -161,9 +160,7 @@ class Fitting(nn.Module):
 
     def save(self, file: Path) -> None:
         """Write it; complete or not at all."""
-        with atomic_file(file) as temporary:
-            told = {"settings": self.settings.model_dump_json()}
-            write_tensors(dict(self.named_buffers()), temporary, told)
+        write_tensors(dict(self.named_buffers()), file, {"settings": self.settings.model_dump_json()})
 
     @classmethod
     @torch.inference_mode(False)  # its maps take part in gradients

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from derender.storage.atomic import atomic_file
 from derender.storage.tensors import read_tensors, write_tensors
 
 _MIRRORED = "reads_mirror_image"  # in a file: maps take images with their mirror images
@@ -159,8 +158,7 @@ class Whitening(nn.Module):
 
     def save(self, file: Path) -> None:
         """Write the projections; complete or not at all."""
-        with atomic_file(file) as temporary:
-            write_tensors(dict(self.named_buffers()), temporary)
+        write_tensors(dict(self.named_buffers()), file)
 
     @classmethod
     def load(cls, file: Path) -> "Whitening":

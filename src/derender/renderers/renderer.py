@@ -67,7 +67,8 @@ class Renderer:
         rendering = warp(image, scene.depth, scene.camera, fov_deg, backend)
         if self.atmosphere is not None:
             rendering = self.atmosphere(rendering, scene)
-        if self._staged and not _finite(rendering.image) and all(map(_finite, scene.parameters.values())):
+        staged = any(getattr(self, stage) is not None for stage in STAGES)
+        if staged and not _finite(rendering.image) and all(map(_finite, scene.parameters.values())):
             raise ValueError(
                 f"the renderer {self.name!r} makes NaN or infinity of finite scenes: look for a division by "
                 "0, or a root or logarithm of negative values, in its stages"
@@ -140,10 +141,6 @@ class Renderer:
                         f"{row.name} {number.name} must lie in {number.low:g}..{number.high:g} for the "
                         f"renderer {self.name!r}, got {least if least < number.low else most:g}"
                     )
-
-    @property
-    def _staged(self) -> bool:
-        return any(getattr(self, stage) is not None for stage in STAGES)
 
     def __add__(self, other: "Renderer") -> "Renderer":
         """The stages and factors of both; where both set the same one, a ValueError."""

@@ -161,11 +161,6 @@ class Crop:
 WHOLE = Crop()
 
 
-def as_bytes(images: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n 3 h w"]:
-    """Images in 0..1 as bytes, rounded."""
-    return (images * 255).round().to(torch.uint8)
-
-
 def candidate_crops() -> list[Crop]:
     """The grid of the search: the whole image first, then smaller crops, none beyond the image."""
     crops = [WHOLE]

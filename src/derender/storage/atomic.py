@@ -11,9 +11,8 @@ import os
 import shutil
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 
 from derender.storage.bounded import read_json
@@ -167,17 +166,9 @@ def _to_disk(path: Path) -> None:
 
 
 def _exchanged(one: Path, other: Path) -> bool:
-    """Whether the system could let the two take each other's place in one step."""
-    rename = _system_exchange()
-    if rename is None:
+    """Whether the system (Linux's renameat2) could let the two take each other's place in one step."""
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (OSError, AttributeError, TypeError):
         return False
     return rename(_THIS_FOLDER, os.fsencode(one), _THIS_FOLDER, os.fsencode(other), _EXCHANGE) == 0
-
-
-@cache
-def _system_exchange() -> Callable[..., int] | None:
-    """Linux's renameat2, where the C library has it."""
-    try:
-        return ctypes.CDLL(None).renameat2
-    except (OSError, AttributeError, TypeError):
-        return None

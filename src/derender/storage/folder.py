@@ -15,7 +15,7 @@ from derender.settings import Settings
 from derender.storage.atomic import write_whole
 from derender.storage.bounded import first_line, read_json, read_text
 from derender.storage.places import CONFIG_FILE, SPLIT_FILE, TENSOR_FILES, TEXT_FILES, WEIGHTS_FILE
-from derender.storage.tensors import check_fit, read_tensors, write_tensors
+from derender.storage.tensors import check_fit, read_tensors
 
 Net = TypeVar("Net", bound=nn.Module)
 
@@ -79,17 +79,9 @@ def check_factors(folder: Path, config: Mapping[str, Any], factors: Sequence[str
         )
 
 
-def write_model(
-    folder: Path, factors: Sequence[str], settings: Mapping[str, Any], weights: Mapping[str, Tensor]
-) -> None:
-    """Write configuration and weights into a folder that exists."""
-    write_tensors(weights, folder / WEIGHTS_FILE)
-    write_config(folder, factors, settings)
-
-
-def write_config(folder: Path, factors: Sequence[str], settings: Mapping[str, Any]) -> None:
+def write_config(folder: Path, factors: Sequence[str], settings: Settings) -> None:
     """Write a saved model's ``config.json``; complete or not at all."""
-    config = {"format": FORMAT, "factors": list(factors), "settings": settings}
+    config = {"format": FORMAT, "factors": list(factors), "settings": settings.model_dump(mode="json")}
     write_whole(folder / CONFIG_FILE, json.dumps(config, indent=1))
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 
 def download(repository: str, names: Sequence[str]) -> Path:
@@ -28,9 +27,10 @@ def upload(folder: Path, repository: str, *, private: bool, token: str | None) -
     A ValueError: that is no name; a PermissionError: the Hub refuses; a ConnectionError: it cannot be
     reached.
     """
+    from huggingface_hub import HfApi
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalTokenNotFoundError
 
-    hub = client(token)
+    hub = HfApi(token=token)
     try:
         made = hub.create_repo(repository, private=private, exist_ok=True)
         hub.upload_folder(repo_id=made.repo_id, folder_path=folder, commit_message="A derender model")
@@ -47,10 +47,3 @@ def upload(folder: Path, repository: str, *, private: bool, token: str | None) -
             "model.save_pretrained writes the same files to a folder"
         ) from error
     return str(made)
-
-
-def client(token: str | None) -> Any:
-    """The client of the Hub's interface."""
-    from huggingface_hub import HfApi
-
-    return HfApi(token=token)

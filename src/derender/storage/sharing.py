@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from torch import Tensor
 
@@ -26,6 +27,7 @@ from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 class Shareable:
     """Saving, for a model that can write its own files; ``source`` is the folder its weights come from."""
 
+    settings: Any
     source: Path | None = None
 
     @abstractmethod
@@ -35,10 +37,6 @@ class Shareable:
     @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
         """All tensors that ``write`` writes, by name."""
-
-    @abstractmethod
-    def description(self) -> str:
-        """One sentence for the card: what the model does, its sizes and ranges."""
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write settings and weights to ``folder``; complete or not at all."""
@@ -94,7 +92,7 @@ class Shareable:
         parts = {"Trained on": data, "Scores": measured, "Licence": licence}
         paragraphs = [
             f"# {title}",
-            self.description(),
+            self.settings.description(),
             f'```python\nimport derender\n\nmodel = derender.load("{title}")\n```',
             *(f"**{name}**: {text or 'not stated'}" for name, text in parts.items()),
         ]

@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from derender.storage.atomic import write_whole
 from derender.storage.bounded import require_regular
 
 CHECKSUM = "crc32"
@@ -29,9 +30,9 @@ UNIT = ".unit"
 def write_tensors(
     tensors: Mapping[str, Tensor], file: str | Path, metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write tensors, on whatever device, with their checksum; ``metadata`` is kept beside it."""
+    """Write tensors with their checksum, whole or not at all; ``metadata`` is kept beside it."""
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    Path(file).write_bytes(save(plain, {**(metadata or {}), CHECKSUM: checksum(plain)}))
+    write_whole(file, save(plain, {**(metadata or {}), CHECKSUM: checksum(plain)}))
 
 
 def read_tensors(file: str | Path, like: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeature
 from derender.objectives.self_features import load_self_features, train_self_features
 from derender.postprocess import Features
 from derender.postprocess.whitening import Whitening
-from derender.storage.atomic import DamageNoticed, atomic_file
+from derender.storage.atomic import DamageNoticed
 from derender.storage.folder import write_config
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
@@ -69,7 +69,7 @@ def _add_features(
     model = make_features(
         model, some, config.features, seed=config.seed, progress=lambda *done: report(told(*done))
     )
-    write_config(out, [factor.name for factor in model.factors], model.settings.model_dump(mode="json"))
+    write_config(out, [factor.name for factor in model.factors], model.settings)
     model.features.save(out)
     held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
     store_errors(out, torch.from_numpy(np.ascontiguousarray(held_out)))
@@ -167,8 +167,7 @@ def self_features_of(
         images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total),
         device=images.device,
     )  # fmt: skip
-    with atomic_file(file) as temporary:
-        features.save(temporary)
+    features.save(file)
     return features
 
 
