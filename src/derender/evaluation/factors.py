@@ -183,9 +183,10 @@ def evaluate_factors(
         "albedo_control": albedo_error(constant, true, true_mask),
         "albedo_global_control": albedo_error(constant, true, true_mask, one_scale=True),
     }
+    scores: dict[str, Any] = {name: each.nanmean().item() for name, each in albedos.items()}
+    scores |= {f"{name}_each": each.numpy() for name, each in albedos.items()}
     return FactorResult(
-        **{name: each.nanmean().item() for name, each in albedos.items()},
-        **{f"{name}_each": each.numpy() for name, each in albedos.items()},
+        **scores,
         light=light_error(light, camera, true_light, true_camera),
         light_control=_angles(angle_deg(direction.mean(dim=0).expand_as(direction), direction)),
         light_aligned=light_error(light, camera, true_light, true_camera, aligned=True),
