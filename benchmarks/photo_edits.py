@@ -12,7 +12,7 @@ the input turned as a plane.
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from math import acos, cos, degrees, radians
 from pathlib import Path
@@ -28,7 +28,7 @@ import derender
 from derender.data import open_source
 from derender.data.synthetic import faces
 from derender.data.synthetic.settings import LIGHTS, VIEWS, FaceSettings
-from derender.photo import PhotoDetail
+from derender.photo import PhotoDetail, editable_scenes
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
@@ -100,7 +100,8 @@ def yale(model: derender.Derenderer, path: Path, half: str) -> dict[str, dict[st
     people = people[: len(people) // 2] if half == "first" else people[len(people) // 2 :]
     sums: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     photos = {key: square(source.read(file)) for key, file in lights.items() if key[0] in people}
-    scenes = {key: model.decompose(small(photo, model.image_size)) for key, photo in photos.items()}
+    found = scenes_of(model, list(photos.values()))
+    scenes = {key: found[row] for row, key in enumerate(photos)}
     for number, person in enumerate(people):
         own, other = (person, 0, 0), people[(number + 1) % len(people)]
         seen = model.render(at_size(scenes[own], SIZE["yale"])).mask[0] > 0.5
@@ -138,7 +139,7 @@ def heads(model: derender.Derenderer, count: int, seed: int) -> dict[str, dict[s
         return torch.from_numpy(found.images).float() / 255, torch.from_numpy(found.mask > 0)
 
     photos, masks = made()
-    scenes = model.decompose(torch.cat([small(photo, model.image_size) for photo in photos]))
+    scenes = scenes_of(model, photos)
     sums: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     changes = [("light", yaw) for yaw in LIGHT_YAWS] + [("view", yaw) for yaw in TURNS]
     for kind, yaw in changes:
@@ -175,6 +176,12 @@ def square(encoded: bytes) -> Tensor:
     return torch.from_numpy(resized).expand(3, -1, -1)
 
 
+def scenes_of(model: derender.Derenderer, photos: Iterable[Tensor]) -> Scene:
+    """Scenes as edits take them."""
+    images = torch.cat([small(photo, model.image_size) for photo in photos])
+    return Scene.joined([editable_scenes(model, batch) for batch in images.split(64)])
+
+
 def small(photo: Tensor, size: int) -> Tensor:
     """What the model is given."""
     pixels = (photo * 255).round().byte().permute(1, 2, 0).numpy()
@@ -202,7 +209,7 @@ def main() -> None:
     options.add_argument("--yale", type=Path, help="the cropped Extended Yale B, folder or zip")
     options.add_argument("--half", choices=("first", "second"), default="second", help="of the people")
     options.add_argument("--heads", type=int, default=40, help="number of generated heads")
-    options.add_argument("--seed", type=int, default=5_000, help="1000 and 3000 were used to choose settings")
+    options.add_argument("--seed", type=int, default=7_000, help="1000, 3000 and 5000 were looked at before")
     chosen = options.parse_args()
     with torch.inference_mode():
         result: dict = {"seed": chosen.seed, "heads": chosen.heads, "half": chosen.half}
