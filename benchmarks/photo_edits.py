@@ -3,9 +3,9 @@
 Extended Yale B (``--yale``, the cropped set or a zip of it): the picture of each person in frontal light is
 given the light of each other picture, by the angle between light and view. Heads are generated at 256 pixels,
 one a person, the same head once more in the new light or view, so that the truth is exact. PSNR in dB and
-SSIM, where the model draws a surface. Beside derender's edits: the model's own rendering, the unchanged
-input, the input with the brightness of the truth, the ratio of another person's two pictures, and for views
-the input turned as a plane.
+SSIM, where the model draws a surface. Beside derender's edits: the model's rendering of the same scene, that
+of the feed-forward scene (``--detail model``), the unchanged input, the input with the brightness of the
+truth, the ratio of another person's two pictures, and for views the input turned as a plane.
 
     .venv/bin/python benchmarks/photo_edits.py --yale yaleb.zip --json benchmarks/results/photo_edits.json
 """
@@ -14,6 +14,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import acos, cos, degrees, radians
 from pathlib import Path
 
@@ -75,7 +76,7 @@ def edits(model: derender.Derenderer) -> dict[str, Callable[[Case], Tensor]]:
         return case.photo * gain
 
     return {
-        "derender": photo, "--detail model": rendered, "input": lambda case: case.photo,
+        "derender": photo, "the same scene, model's colours": rendered, "input": lambda case: case.photo,
         "input, brightness of the truth": brightness,
     }  # fmt: skip
 
@@ -90,7 +91,9 @@ def flat(model: derender.Derenderer) -> Callable[[Case], Tensor]:
     return turned
 
 
-def yale(model: derender.Derenderer, path: Path, half: str) -> dict[str, dict[str, tuple[float, float]]]:
+def yale(
+    model: derender.Derenderer, path: Path, half: str, steps: int | None = None
+) -> dict[str, dict[str, tuple[float, float]]]:
     """Mean scores by method and by the angle between light and view."""
     source, lights = open_source(path), {}
     for file in source.files:
@@ -100,7 +103,7 @@ def yale(model: derender.Derenderer, path: Path, half: str) -> dict[str, dict[st
     people = people[: len(people) // 2] if half == "first" else people[len(people) // 2 :]
     sums: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     photos = {key: square(source.read(file)) for key, file in lights.items() if key[0] in people}
-    found = scenes_of(model, list(photos.values()))
+    found = scenes_of(model, list(photos.values()), steps)
     scenes = {key: found[row] for row, key in enumerate(photos)}
     for number, person in enumerate(people):
         own, other = (person, 0, 0), people[(number + 1) % len(people)]
@@ -127,7 +130,9 @@ def yale(model: derender.Derenderer, path: Path, half: str) -> dict[str, dict[st
     return means(sums)
 
 
-def heads(model: derender.Derenderer, count: int, seed: int) -> dict[str, dict[str, tuple[float, float]]]:
+def heads(
+    model: derender.Derenderer, count: int, seed: int, steps: int | None = None
+) -> dict[str, dict[str, tuple[float, float]]]:
     """Mean scores by method and by what was changed; the source is lit from the front and looks ahead."""
     light, view = LIGHTS["frontal"], VIEWS["frontal"]
 
@@ -139,7 +144,7 @@ def heads(model: derender.Derenderer, count: int, seed: int) -> dict[str, dict[s
         return torch.from_numpy(found.images).float() / 255, torch.from_numpy(found.mask > 0)
 
     photos, masks = made()
-    scenes = scenes_of(model, photos)
+    scenes = scenes_of(model, photos, steps)
     sums: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     changes = [("light", yaw) for yaw in LIGHT_YAWS] + [("view", yaw) for yaw in TURNS]
     for kind, yaw in changes:
@@ -176,10 +181,10 @@ def square(encoded: bytes) -> Tensor:
     return torch.from_numpy(resized).expand(3, -1, -1)
 
 
-def scenes_of(model: derender.Derenderer, photos: Iterable[Tensor]) -> Scene:
-    """Scenes as edits take them."""
+def scenes_of(model: derender.Derenderer, photos: Iterable[Tensor], steps: int | None) -> Scene:
+    """Scenes as edits take them, or optimised in so many steps."""
     images = torch.cat([small(photo, model.image_size) for photo in photos])
-    return Scene.joined([editable_scenes(model, batch) for batch in images.split(64)])
+    return Scene.joined([editable_scenes(model, batch, steps) for batch in images.split(64)])
 
 
 def small(photo: Tensor, size: int) -> Tensor:
@@ -187,6 +192,14 @@ def small(photo: Tensor, size: int) -> Tensor:
     pixels = (photo * 255).round().byte().permute(1, 2, 0).numpy()
     resized = Image.fromarray(pixels).resize((size, size), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(resized)).permute(2, 0, 1)[None].float() / 255
+
+
+def beside_plain(scored: Callable[..., dict]) -> dict:
+    """All rows, and that of feed-forward scenes in the model's colours."""
+    rows, plain = scored(), scored(steps=0)
+    first, second, *others = rows
+    names = [first, second, "--detail model", *others]
+    return {name: (plain[second] if name == "--detail model" else rows[name]) for name in names}
 
 
 def means(sums: Mapping[str, Mapping[str, list]]) -> dict[str, dict[str, tuple[float, float]]]:
@@ -213,10 +226,11 @@ def main() -> None:
     chosen = options.parse_args()
     with torch.inference_mode():
         result: dict = {"seed": chosen.seed, "heads": chosen.heads, "half": chosen.half}
-        result["generated heads"] = heads(derender.load("rendered-faces-64"), chosen.heads, chosen.seed)
+        rendered, photographs = derender.load("rendered-faces-64"), derender.load("faces-64")
+        result["generated heads"] = beside_plain(partial(heads, rendered, chosen.heads, chosen.seed))
         show("generated heads, rendered-faces-64", result["generated heads"])
         if chosen.yale is not None:
-            result["yale"] = yale(derender.load("faces-64"), chosen.yale, chosen.half)
+            result["yale"] = beside_plain(partial(yale, photographs, chosen.yale, chosen.half))
             show("Extended Yale B, faces-64", result["yale"])
     publish(result, chosen.json)
 

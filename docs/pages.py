@@ -113,6 +113,7 @@ def edits(which: str, angles: dict[str, str]) -> Callable[[Any], Iterator[list[s
     """PSNR and SSIM of edited photographs by angle."""
     names = {
         "derender": "derender, photograph's own pixels", "--detail model": "derender, `--detail model`",
+        "the same scene, model's colours": "model's rendering of the same scene",
         "input": "unchanged photograph",
         "input, brightness of the truth": "unchanged, brightness of the truth",
         "input turned as a plane": "turned as a plane",
