@@ -42,7 +42,7 @@ COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
 COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carried over from
 RIM_SHARE = 0.04  # of the side: the rim of the model's maps, where depth ends in a wall
 REACH_SHARE = 1 / 4  # of the side: how far the surface goes on around them, at least
-FADE_SHARE = 1 / 8  # reach of new shading around them
+FADE_SHARE = 1 / 3  # reach of new shading around them
 SURE, LIKELY = (
     0.65,
     (0.8, 0.6),
