@@ -87,9 +87,7 @@ def brightness(
     table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
     seen["constant answer"] = {"albedo": np.tile(mean.mean(axis=0), (len(mean), 1)), "light": nothing}
     apart = {name: {"chroma": _apart(one["albedo"], mean)} for name, one in seen.items()}
-    rows = image_rows(
-        apart, {"chroma": (_CHROMA, 1.0)}, groups=people, resample_count=how.resamples, seed=how.seed
-    )
+    rows = image_rows(apart, {"chroma": _CHROMA}, groups=people, resample_count=how.resamples, seed=how.seed)
     light = {name: agreement(one["light"], mean @ LUMA, weights)["r"] for name, one in seen.items()}
     rows = [replace(row, scores={**row.scores, "light": light[row.name]}) for row in rows]
     columns = {"chroma": _CHROMA, "light": _LIGHT}
@@ -253,7 +251,7 @@ def relight(
         caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {len(people)} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
         values[title.lower()] = numbers_of(scored)
-        notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": (columns["all"], 1.0)})]
+        notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": columns["all"]})]
     return Scores(tables, values, notes)
 
 
