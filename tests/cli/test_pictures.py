@@ -256,7 +256,7 @@ def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos
         assert main([name, "-m", model, str(one), "-o", str(tmp_path / f"no-{name}"), *rest]) == 0
         printed = capsys.readouterr().err
         assert "reconstructed worse" not in printed and "not in the crop" not in printed
-    write_errors(known, HeldOutErrors(np.linspace(0, 0.001, 101), 50))
+    write_errors(known, HeldOutErrors(pictures=50, quantiles=list(np.linspace(0, 0.001, 101))))
     told = tmp_path / "told.json"
     words = ["--size", "32", "--from", str(two), "--factor", "light", "--json", str(told)]
     assert main(["swap", "-m", str(known), str(one), "-o", str(tmp_path / "swapped"), *words]) == 0
@@ -264,7 +264,7 @@ def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos
     assert "2 of 2 images are reconstructed worse than 99 % of those this model was validated on" in printed
     assert f"{one} is one" in printed
     assert json.loads(told.read_text())["reconstruction_percentile"] == {str(one): 100, str(two): 100}
-    write_errors(known, HeldOutErrors(np.linspace(0, 2, 101), 50))
+    write_errors(known, HeldOutErrors(pictures=50, quantiles=list(np.linspace(0, 2, 101))))
     assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "usual"), "--size", "32"]) == 0
     printed = capsys.readouterr().err
     assert "out-of-distribution" not in printed

@@ -293,7 +293,7 @@ def finetune(
     def embed(numbers: np.ndarray) -> torch.Tensor:
         pictures = as_float(np.ascontiguousarray(images[numbers])).to(device)
         parts = (
-            [net.encode(pictures) for net in nets.values()]
+            [net.encoder(pictures) for net in nets.values()]
             if ours
             else nets["whole"].embed(pictures).values()
         )
