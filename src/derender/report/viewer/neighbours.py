@@ -8,7 +8,6 @@ and no model saw them in training. Rows of a table are read from folders, zips a
 stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from io import BytesIO
@@ -21,6 +20,8 @@ from PIL import Image, ImageOps
 
 from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
+from derender.report.colours import pictures
+from derender.report.page import data_uri, image_bytes
 from derender.report.viewer.questions import Refused, pixels_of
 
 ROWS = {
@@ -28,7 +29,7 @@ ROWS = {
     "rendered-faces-64": "faces.png",
     "cars-64": "cars.png",
 }
-LABELS_SHOWN = 4
+LABELS_SHOWN, THUMBNAIL = 4, 96
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,9 @@ class Example:
     name: str
     picture: UInt8[np.ndarray, "h w 3"]
 
-    def thumbnail(self, size: int) -> Image.Image:
+    def thumbnail(self, size: int = THUMBNAIL) -> Image.Image:
         """Its middle square."""
         return ImageOps.fit(Image.fromarray(self.picture), (size, size))
-
-
-def named_examples(images: Mapping[Path, np.ndarray]) -> list[Example]:
-    """Images by file name."""
-    return [Example(path.name, pixels) for path, pixels in images.items()]
 
 
 def rendered_examples(model: str, image_size: int | None = None) -> list[Example]:
@@ -85,11 +81,15 @@ class Gallery:
         if source is not None and not any(file in self._position for file in table.files):
             raise ValueError(f"{source} holds none of the table's images, such as {table.files[0]!r}")
 
-    def about(self, row: int) -> dict[str, Any]:
-        """Name and labels of a row, as text."""
+    def shown(self, row: int) -> dict[str, Any]:
+        """A row as JSON has it: its name, labels and image; None for an image that cannot be shown."""
         labels = [name for name in self.table.labels if name != "partition"][:LABELS_SHOWN]
-        shown = {name: str(self.table.labels[name][row]) for name in labels}
-        return {"row": row, "file": self.table.files[row], "labels": shown}
+        named = {name: str(self.table.labels[name][row]) for name in labels}
+        try:
+            image = data_url(pictures(self.picture(row, THUMBNAIL)[None])[0])
+        except Refused:
+            image = None
+        return {"row": row, "file": self.table.files[row], "labels": named, "image": image}
 
     def picture(self, row: int, size: int) -> UInt8[np.ndarray, "3 s s"]:
         """The image of a row; ``Refused`` (404, 413, 415) where it cannot be shown."""
@@ -121,3 +121,8 @@ def _listed(place: str, dataset: str) -> ListedStream:
         return stream
     stream.close()
     raise ValueError(f"{place} can only be read from its beginning: images of rows are not shown")
+
+
+def data_url(image: Image.Image) -> str:
+    """An image that travels inside JSON."""
+    return data_uri(image_bytes(image, compress_level=1))
