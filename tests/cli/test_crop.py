@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.scene.crop import Crop
 
 KNOWN = "rendered-faces-64"

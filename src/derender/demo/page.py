@@ -25,7 +25,7 @@ from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.evidence import looping_films
 from derender.report.page import DIRECTIONS, Page
 from derender.report.run import loss_charts
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS
 from derender.training.run_folder import read_metrics

@@ -16,7 +16,7 @@ pytest.importorskip("uvicorn", reason="the viewer's packages are not installed: 
 
 from derender import Derenderer
 from derender.report.viewer.app import Application
-from derender.report.viewer.neighbours import Example
+from derender.report.viewer.images import Example
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 

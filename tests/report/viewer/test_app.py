@@ -16,7 +16,7 @@ from PIL import Image
 from derender import Derenderer, load
 from derender.data.synthetic import faces
 from derender.report.viewer.app import Application
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.report.viewer.questions import CropRequest, Light, Place, Refused, ViewRequest
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.studio import Shelf, Studio

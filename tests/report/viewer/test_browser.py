@@ -17,7 +17,7 @@ from derender.data.synthetic import faces
 from derender.features import FeatureTable, embed_images
 from derender.model import Derenderer
 from derender.report.viewer.app import Application
-from derender.report.viewer.neighbours import Example, Gallery
+from derender.report.viewer.images import Example, Gallery
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender import load
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.storage.places import bundled_models, model_folder
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, read_errors, reconstruction_percentile
 

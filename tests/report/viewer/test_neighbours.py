@@ -8,7 +8,7 @@ from derender.data import read_images
 from derender.features import FeatureTable, embed_image_set
 from derender.features.neighbours import nearest
 from derender.report.viewer.app import Application
-from derender.report.viewer.neighbours import Gallery
+from derender.report.viewer.images import Gallery
 from derender.report.viewer.questions import Refused
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio

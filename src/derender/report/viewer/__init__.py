@@ -2,8 +2,7 @@
 
 questions   requests of the page, checked; uploads to pixels
 studio      requests to images, meshes and archives, without HTTP
-shelf       opened images, in memory only
-neighbours  images to begin with; rows of a feature table near to an image
+images      opened images, in memory only; examples; rows of a feature table near to an image
 app         addresses, and bounds on size and time
 server      a socket, and uvicorn on it; requests that it accepts, and their bodies
 page/       HTML, CSS and JavaScript, which need nothing from elsewhere

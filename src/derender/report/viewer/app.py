@@ -25,7 +25,7 @@ from derender.data import read_photo
 from derender.features import FeatureTable
 from derender.model import Derenderer
 from derender.report.opening import held_out_errors, readable
-from derender.report.viewer.neighbours import Example, Gallery, rendered_examples
+from derender.report.viewer.images import KEPT, Example, Gallery, Shelf, rendered_examples
 from derender.report.viewer.questions import (
     BODY_LIMIT_BYTES,
     LARGEST_SIZE,
@@ -41,7 +41,6 @@ from derender.report.viewer.questions import (
     too_large,
 )
 from derender.report.viewer.server import Body, Guard, Uploads
-from derender.report.viewer.shelf import KEPT, Shelf
 from derender.report.viewer.studio import Studio
 
 LONG_WORK = 6

@@ -34,7 +34,7 @@ from derender.report.mesh import model_mesh
 from derender.report.page import image_bytes
 from derender.report.panel import labelled_grid
 from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
-from derender.report.viewer.neighbours import Example, Gallery, data_url
+from derender.report.viewer.images import Example, Gallery, Shelf, ShownImage, data_url
 from derender.report.viewer.questions import (
     Camera,
     CropRequest,
@@ -45,7 +45,6 @@ from derender.report.viewer.questions import (
     Refused,
     ViewRequest,
 )
-from derender.report.viewer.shelf import Shelf, ShownImage
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.training.held_out_errors import (
