@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from derender.cli.images import ImageFiles, opener_of
-from derender.cli.options import Output, TrainedModel, command, option
+from derender.cli.options import ImageModel, Output, command, option
 from derender.report.options import EDIT_SIZE, FilmOptions, ImageOptions
 
 FACTOR = "Factor to take; may be repeated. By default each in turn."
@@ -13,7 +13,7 @@ FACTOR = "Factor to take; may be repeated. By default each in turn."
 
 @command("relight", "relight --model runs/faces me.jpg --like sunset.jpg --out relit/")
 def relight(
-    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, film: FilmOptions,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
     like: Path | None = option(None, "Go to the lighting of this image.", metavar="IMAGE"),
     reach: float = option(60.0, "Reach of the light to either side, in degrees."),
     pitch: float = option(10.0, "Height of the light, in degrees."),
@@ -36,7 +36,7 @@ def relight(
 
 @command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")
 def rotate(
-    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, film: FilmOptions,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
     reach: float = option(40.0, "Rotation of the object to either side, in degrees."),
     pitch: float = option(0.0, "Nod in degrees: the top comes forward."),
 ) -> None:  # fmt: skip
@@ -50,7 +50,7 @@ def rotate(
 
 @command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")
 def swap(
-    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output,
     source: Path = option(..., "Image to take from.", "--from", metavar="IMAGE"),
     factor: list[str] | None = option(None, FACTOR, metavar="NAME"),
 ) -> None:  # fmt: skip

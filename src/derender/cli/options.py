@@ -196,6 +196,13 @@ class TrainedModel:
 
 
 @dataclass(frozen=True)
+class ImageModel(TrainedModel):
+    """The trained model of a command for photographs."""
+
+    model: Model = "faces-64"
+
+
+@dataclass(frozen=True)
 class GeneratedOptions:
     """The options of both kinds of generated images."""
 

@@ -19,7 +19,7 @@ Named = Annotated[list[Path] | None, typer.Argument(help="Images to begin with."
 
 @command("view", "view --model rendered-faces-64 --port 8000")
 def view(
-    model: options.TrainedModel, images: Named = None,
+    model: options.ImageModel, images: Named = None,
     features: Path | None = option(None, TABLE, "-f", "--features", metavar="FILE"),
     data: str | None = option(None, "Place of the table's images, if moved.", "-d", "--data", metavar="PATH"),
     dataset: options.Dataset = "auto",
@@ -54,7 +54,7 @@ def view(
             loaded = maker_of(table, loaded, str(features))
         studio, notes = open_viewer(
             loaded, model.model, images or [], table=table, data=data, dataset=dataset, keep=keep,
-            fit_steps=fit_steps or 0, frame=frame,
+            fit_steps=fit_steps, frame=frame,
         )  # fmt: skip
         if not is_loopback(host):
             notes.append(f"warning: anyone who can reach {host} can use this page, and there is no password")

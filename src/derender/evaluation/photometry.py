@@ -14,6 +14,7 @@ person's two. Leaves out cast shadows.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from derender.evaluation.score_table import Column, Scores, scored_table
 from derender.features import map_batches, missing
 from derender.inputs import Progress, as_images, as_model
 from derender.model import Derenderer
-from derender.photo import PhotoDetail
+from derender.photo import PhotoDetail, editable_scenes
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
@@ -187,21 +188,22 @@ def relight(
         model: a model, or the name or folder of one.
         images: the address of images with identity and light, such as the cropped Extended Yale B.
         size: side in pixels of the images that are relit, at least the model's.
-        fit_steps: steps of per-image optimisation of the model's scenes.
+        fit_steps: steps of per-image optimisation of the scenes; by default those of edits.
         options: seed, resamples, dataset, limit, device, progress: fields of ``Options``.
 
     Raises:
         ValueError: the images lack identity or light, or no two people share two lights.
     """
     how = Options(images=images, **{"keep_duplicates": True, **options})
-    model = optimised(as_model(model, device=how.device), fit_steps)
+    model = as_model(model, device=how.device)
     read = how.at(model.image_size)
     if lacking := [name for name in NEEDED if name not in read.labels]:
         raise ValueError(f"{read.source} has no label {lacking[0]!r}: give images of known light, as Yale B")
     large = read if isinstance(images, ImageSet) else as_images(
         images, size, dataset=how.dataset, limit=how.limit, keep_duplicates=True
     )  # fmt: skip
-    batches = map_batches(model.decompose, model, read.images, batch_size=64, progress=how.stage("model"))
+    scenes_of = partial(editable_scenes, model, steps=fit_steps)
+    batches = map_batches(scenes_of, model, read.images, batch_size=64, progress=how.stage("model"))
     scenes = Scene.joined(batches)
     who, off = read.labels["identity"].astype(str), read.labels["light_deg"]
     lit = list(zip(read.labels[NEEDED[1]].tolist(), read.labels[NEEDED[2]].tolist(), strict=True))

@@ -7,6 +7,7 @@ on request, and drawn in its own detail unless that is declined. Leaves out edit
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ from derender.data import as_float, is_image, read_photo
 from derender.data.source import FolderSource
 from derender.features import map_batches
 from derender.model import Derenderer
-from derender.photo import Frame, PhotoDetail, Photograph, found_frame, is_video
+from derender.photo import Frame, PhotoDetail, Photograph, editable_scenes, found_frame, is_video
 from derender.render import Rendering
 from derender.report.colours import depth_range
 from derender.report.options import WHOLE_SIZE, ImageOptions
@@ -117,10 +118,9 @@ class ImageOpener:
     def decomposed(self, read: Mapping[Path, Read]) -> list[OpenedImage]:
         """Every image with its scene, feed-forward or optimised, at the model's size."""
         steps, stacked = self.options.fit_steps, np.stack([pixels for pixels, *_ in read.values()])
-
-        def scenes_of(images: Tensor) -> Scene:
-            return self.model.fit_scenes(images, steps).scene if steps else self.model.decompose(images)
-
+        if steps is None and not self.whole:
+            steps = 0
+        scenes_of = partial(editable_scenes, self.model, steps=steps)
         batches = map_batches(scenes_of, self.model, stacked, batch_size=self.options.batch_size)
         scenes = [batch[row].detach() for batch in batches for row in range(len(batch))]
         limits = depth_range(torch.cat([scene.depth.cpu() for scene in scenes]))

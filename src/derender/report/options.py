@@ -44,7 +44,10 @@ class ImageOptions:
     )
     texture: str | None = option(None, "Old spelling of detail.", hidden=True)
     fit_steps: int | None = option(
-        None, "Optimise each scene against its image in N steps (60, say; slow).", min=0, max=10_000
+        None,
+        "Optimise each scene against its image in N steps; by default 20 for edits, else 0.",
+        min=0,
+        max=10_000,
     )
     frame: str | None = option(
         None,

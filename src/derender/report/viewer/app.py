@@ -24,6 +24,7 @@ from derender import __version__
 from derender.data import read_photo
 from derender.features import FeatureTable
 from derender.model import Derenderer
+from derender.photo import editing_steps
 from derender.report.opening import held_out_errors, readable
 from derender.report.viewer.images import KEPT, Example, Gallery, Shelf, rendered_examples
 from derender.report.viewer.questions import (
@@ -75,7 +76,7 @@ def open_viewer(
     data: str | None = None,
     dataset: str = "auto",
     keep: int = KEPT,
-    fit_steps: int = 0,
+    fit_steps: int | None = None,
     frame: str | None = None,
 ) -> tuple[Studio, list[str]]:
     """A model with images to begin with and rows to search, and notes on what is missing.
@@ -86,7 +87,7 @@ def open_viewer(
         table: features made by this model, for nearest neighbours.
         data, dataset: place of the table's images, if not as the table records it, and its layout.
         keep: opened images held in memory.
-        fit_steps, frame: as ``Studio`` takes them.
+        fit_steps, frame: as ``Studio`` takes them; by default the steps of edits.
     """
     if fit_steps:
         model.features.required_fitting(source)
@@ -104,7 +105,7 @@ def open_viewer(
     named = [Example(path.name, pixels) for path, pixels in read.items()]
     studio = Studio(
         model, Path(source).name, Shelf(keep), named if images else rendered_examples(source), gallery,
-        held_out_errors(source), fit_steps, frame,
+        held_out_errors(source), editing_steps(model, fit_steps), frame,
     )  # fmt: skip
     return studio, notes
 
