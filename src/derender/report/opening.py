@@ -31,8 +31,9 @@ from derender.training.held_out_errors import HeldOutErrors, read_errors, recons
 
 T = TypeVar("T")
 Read = tuple[np.ndarray, Frame, dict[str, Any], np.ndarray]
-"""Pixels (3, S, S) at the model's size, the part of the file that they show, that part as JSON has it, and
-the pixels by which the image is judged, which no search by their error chose."""
+"""Pixels (3, S, S) at the model's size, the part of the file that they show, that part as JSON has it.
+
+Last the pixels by which the image is judged: no search by their error chose them."""
 
 
 @dataclass(frozen=True)
