@@ -395,6 +395,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "verification": ("verification.json", scored(PAIRS, "rows")),
     "pose": ("pose.json", angles),
     "light": ("light.json", angles),
+    "light-optimised": ("light-optimised.json", angles),
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
     "renderers": ("renderers_fit.json", renderers),
     "renderers-speed": ("renderers_speed.json", renderer_speed),

@@ -18,6 +18,7 @@ from derender.cli import console, main
 from derender.cli.console import duration
 from derender.report.decomposition import COLUMN_MEANING
 from derender.settings import plain
+from derender.storage.places import bundled_models
 from derender.training import derender_task
 from derender.training.process import TrainingInterrupted
 
@@ -256,3 +257,17 @@ def test_time_left_is_counted_from_the_first_item_of_a_phase(monkeypatch, capsys
         for clock.now, done, phase in ((5000.0, 1, "before"), (5050.0, 1, "next"), (5090.0, 5, "next")):
             say(done, 11, description=phase)
     assert "next: 5 of 11 images, 1 min 0 s left" in capsys.readouterr().err
+
+
+def test_every_bundled_model_is_listed_with_what_it_was_trained_on(numbers):
+    rows = numbers("models")[0]["models"]
+    assert [row["name"] for row in rows] == list(bundled_models())
+    for row in rows:
+        assert row["image_size"] == int(row["name"].rsplit("-")[-1]) and 5 < row["megabytes"] < 30
+        assert row["about"].startswith("Trained on ") and len(row["about"]) < 90
+
+
+def test_a_feature_table_in_another_format_is_refused(refused, tmp_path):
+    out = tmp_path / "features.csv"
+    assert "parquet" in refused("embed", tmp_path, "--model", "faces-64", "--out", out)
+    assert not out.exists()

@@ -1,14 +1,12 @@
 """`--frame auto` (formerly `--crop`): a model is shown the part of an image that it knows."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from derender.cli import main
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.scene.crop import Crop
 
 KNOWN = "rendered-faces-64"
@@ -29,18 +27,11 @@ def photos(tmp_path_factory) -> Path:
     return folder
 
 
-def _run(command: str, photos: Path, out: Path, *words: str) -> dict:
-    names = [str(photos / "near.png"), str(photos / "wide.png")]
-    told = out.parent / f"{out.name}.json"
-    assert main([command, "-m", KNOWN, *names, "-o", str(out), "--json", str(told), *words]) == 0
-    return json.loads(told.read_text())
-
-
-def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
-    whole = _run("decompose", photos, tmp_path / "whole", "--frame", "none")
-    assert "or another crop (derender align, --frame)" in capsys.readouterr().err
-    found = _run("decompose", photos, tmp_path / "framed", "--crop", "auto")
-    printed = capsys.readouterr().err
+def test_the_part_is_found_told_and_drawn(photos, tmp_path, numbers):
+    both = ("-m", KNOWN, photos / "near.png", photos / "wide.png", "-o")
+    whole, printed = numbers("decompose", *both, tmp_path / "whole", "--frame", "none")
+    assert "or another crop (derender align, --frame)" in printed
+    found, printed = numbers("decompose", *both, tmp_path / "framed", "--crop", "auto")
     assert "shown in part, 70 % of their side: 1 of 2 images" in printed
     assert "1 of 2 images are reconstructed worse than 99 %" in printed  # chosen by that error: no acquittal
     near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
@@ -54,11 +45,12 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, capsys):
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "framed" / "near" / "input.png")), beside)
 
 
-def test_detail_films_and_meshes_are_of_the_same_part(photos, tmp_path):
-    words = ["--frame", "auto", "--texture", "original"]
-    few = ["--stills", "2", "--film", "none"]
-    relit = _run("relight", photos, tmp_path / "relit", *words, *few, "--like", str(photos / "wide.png"))
-    meshes = _run("mesh", photos, tmp_path / "meshes", *words)
+def test_detail_films_and_meshes_are_of_the_same_part(photos, tmp_path, numbers):
+    words = ("-m", KNOWN, photos / "near.png", photos / "wide.png", "--frame", "auto")
+    words += ("--texture", "original", "-o")
+    few = ["--stills", "2", "--film", "none", "--like", photos / "wide.png"]
+    relit, _ = numbers("relight", *words, tmp_path / "relit", *few)
+    meshes, _ = numbers("mesh", *words, tmp_path / "meshes")
     assert relit["framing"] == meshes["framing"]
     assert relit["framing"][str(photos / "wide.png")]["side"] < 1
 

@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender import Derenderer
-
 QUICK = ["--resamples", "20"]
 EMBEDDED = [*QUICK, "--untrained-seeds", "1", "--cache", "none"]
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> str:
-    net = Derenderer.from_preset("small", image_size=32, width=4, light_width=4, code_size=12)
-    return str(net.save(tmp_path_factory.mktemp("known") / "model"))
 
 
 @pytest.fixture(scope="module")
@@ -28,8 +20,8 @@ def folder(tmp_path_factory) -> str:
     return str(folder)
 
 
-def test_identification_by_light_of_one_half(model, folder, numbers, tmp_path):
-    words = ["evaluate", "identify", folder, "-m", model, "--half", "test", *EMBEDDED]
+def test_identification_by_light_of_one_half(tiny, folder, numbers, tmp_path):
+    words = ["evaluate", "identify", folder, "-m", tiny, "--half", "test", *EMBEDDED]
     found, notes = numbers(*words, "--markdown", tmp_path / "table.md")
     people = found["people"]
     assert 0 < people < 8 and found["half"] == "test" and "half=test" in notes
@@ -40,15 +32,15 @@ def test_identification_by_light_of_one_half(model, folder, numbers, tmp_path):
     assert rest["people"] == 8 - people and not set(rest["gallery"]) & set(found["gallery"])
 
 
-def test_light_against_the_names(model, folder, numbers):
-    found, _ = numbers("evaluate", "light", folder, "-m", model, *QUICK)
+def test_light_against_the_names(tiny, folder, numbers):
+    found, _ = numbers("evaluate", "light", folder, "-m", tiny, *QUICK)
     rows = found["azimuth"]
     assert found["pictures"] == 24 and set(rows) == {"model", "untrained model", "constant answer"}
     assert rows["constant answer"]["scores"]["error"]["value"] == pytest.approx(80 / 3, rel=1e-4)
 
 
-def test_what_is_wrong_is_named(model, folder, refused, tmp_path):
+def test_what_is_wrong_is_named(tiny, folder, refused, tmp_path):
     (tmp_path / "pairs.txt").write_text("1 1\nAda 1 2\nAda 1 Bo 1\n")
-    words = ["evaluate", "verify", folder, "-m", model, "--pairs", tmp_path / "pairs.txt", *EMBEDDED]
+    words = ["evaluate", "verify", folder, "-m", tiny, "--pairs", tmp_path / "pairs.txt", *EMBEDDED]
     assert "3 of 3 images of the pairs are not there (first Ada_0001)" in refused(*words)
-    assert "has no labels camera_y_rad" in refused("evaluate", "pose", folder, "-m", model, *QUICK)
+    assert "has no labels camera_y_rad" in refused("evaluate", "pose", folder, "-m", tiny, *QUICK)

@@ -12,21 +12,15 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from tests.cli.conftest import noise
+from tests.cli.conftest import noise, run
 
 from derender import Derenderer
-from derender.cli import main
 from derender.report.edits import Edit
-from derender.report.opening import ImageOptions
+from derender.report.options import ImageOptions
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
 
 SIZE = 32
-
-
-@pytest.fixture(scope="module")
-def model(tiny) -> str:
-    return str(tiny)
 
 
 @pytest.fixture(scope="module")
@@ -36,25 +30,25 @@ def photos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def table(model, photos) -> str:
+def table(tiny, photos) -> str:
     path = photos.parent / "F.parquet"
-    assert main(["embed", "--model", model, "--data", str(photos), "--out", str(path)]) == 0
+    assert run("embed", "--model", tiny, "--data", photos, "--out", path) == 0
     return str(path)
 
 
 @pytest.mark.parametrize("command", ["decompose", "relight", "rotate", "swap", "mesh"])
 def test_every_field_of_the_image_options_is_an_option(command, capsys):
-    assert main([command, "--help"]) == 0
+    assert run(command, "--help") == 0
     shown = capsys.readouterr().out
     for field in fields(ImageOptions):
         named = f"--{field.name.replace('_', '-')}" in shown
         assert named != field.metadata.get("hidden", False), field.name
 
 
-def test_relight_sweeps_and_says_which_light(model, photos, tmp_path, numbers):
+def test_relight_sweeps_and_says_which_light(tiny, photos, tmp_path, numbers):
     out = tmp_path / "out"
     words = ["--stills", "3", "--frames", "4", "--size", "40", "--reach", "30", "--film", "gif"]
-    told, _ = numbers("relight", "-m", model, photos / "0.png", photos / "1.png", "-o", out, *words)
+    told, _ = numbers("relight", "-m", tiny, photos / "0.png", photos / "1.png", "-o", out, *words)
     assert sorted(path.name for path in out.iterdir()) == ["0", "1", "sheet.png"]
     stills = json.loads((out / "0" / "moved.json").read_text())["stills"]
     assert [still["label"] for still in stills] == ["light -30°", "light 0°", "light +30°"]
@@ -67,21 +61,21 @@ def test_relight_sweeps_and_says_which_light(model, photos, tmp_path, numbers):
     assert told["sheets"] == [str(out / "sheet.png")]
 
 
-def test_relight_ends_in_the_light_of_another(model, photos, tmp_path):
+def test_relight_ends_in_the_light_of_another(tiny, photos, tmp_path):
     out = tmp_path / "out"
-    words = ["--like", str(photos / "2.png"), "--stills", "2", "--film", "none", "--size", "32"]
-    assert main(["relight", "-m", model, str(photos / "0.png"), "-o", str(out), *words]) == 0
+    words = ["--like", photos / "2.png", "--stills", 2, "--film", "none", "--size", 32]
+    assert run("relight", "-m", tiny, photos / "0.png", "-o", out, *words) == 0
     first, last = json.loads((out / "0" / "moved.json").read_text())["stills"]
-    assert main(["decompose", "-m", model, str(photos / "2.png"), "-o", str(tmp_path / "apart")]) == 0
+    assert run("decompose", "-m", tiny, photos / "2.png", "-o", tmp_path / "apart") == 0
     with np.load(tmp_path / "apart" / "2" / "scene.npz") as scene:
         np.testing.assert_allclose(last["light"], scene["light"], atol=1e-5)
         assert np.abs(np.subtract(first["light"], scene["light"])).max() > 1e-4
 
 
-def test_rotate_writes_films_anyone_can_play(model, photos, tmp_path):
+def test_rotate_writes_films_anyone_can_play(tiny, photos, tmp_path):
     out = tmp_path / "out"
-    words = ["--stills", "2", "--frames", "3", "--size", "33", "--pitch", "5"]
-    assert main(["rotate", "-m", model, str(photos / "0.png"), "-o", str(out), *words]) == 0
+    words = ["--stills", 2, "--frames", 3, "--size", 33, "--pitch", 5]
+    assert run("rotate", "-m", tiny, photos / "0.png", "-o", out, *words) == 0
     assert (out / "0" / "film.mp4").read_bytes()[4:8] == b"ftyp"
     assert (out / "0" / "film.gif").read_bytes()[:4] == b"GIF8"
     camera = json.loads((out / "0" / "moved.json").read_text())["stills"][0]["camera"]
@@ -89,22 +83,22 @@ def test_rotate_writes_films_anyone_can_play(model, photos, tmp_path):
     assert not (out / "sheet.png").exists()  # one image needs none
 
 
-def test_swap_of_a_picture_with_itself_changes_nothing(model, photos, tmp_path):
-    out, one = tmp_path / "out", str(photos / "0.png")
-    assert main(["swap", "-m", model, one, "--from", one, "-o", str(out), "--size", "32"]) == 0
+def test_swap_of_a_picture_with_itself_changes_nothing(tiny, photos, tmp_path):
+    out, one = tmp_path / "out", photos / "0.png"
+    swap = ("swap", "-m", tiny, one, "-o", out, "--size", 32, "--from")
+    assert run(*swap, one) == 0
     stills = json.loads((out / "0" / "moved.json").read_text())["stills"]
     assert [still["factor"] for still in stills] == ["geometry", "albedo", "light", "camera"]
     images = {(out / "0" / still["file"]).read_bytes() for still in stills}
     assert len(images) == 1
-    words = ["--from", str(photos / "1.png"), "--factor", "albedo", "--force", "--size", "32"]
-    assert main(["swap", "-m", model, one, "-o", str(out), *words]) == 0
+    assert run(*swap, photos / "1.png", "--factor", "albedo", "--force") == 0
     assert (out / "0" / "still-01.png").read_bytes() not in images
 
 
-def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(model, photos, tmp_path):
+def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(tiny, photos, tmp_path):
     for name, detail in {"own": [], "model": ["--detail", "model"], "old": ["--texture", "original"]}.items():
-        words = ["-m", model, str(photos / "0.png"), "-o", str(tmp_path / name), "--size", "48"]
-        assert main(["mesh", *words, *detail, "--json", str(tmp_path / "told.json")]) == 0
+        words = ["mesh", "-m", tiny, photos / "0.png", "-o", tmp_path / name, "--size", 48, *detail]
+        assert run(*words, "--json", tmp_path / "told.json") == 0
     told = json.loads((tmp_path / "told.json").read_text())["pictures"][0]
     content = (tmp_path / "own" / "0" / "0.glb").read_bytes()
     assert content == (tmp_path / "old" / "0" / "0.glb").read_bytes()
@@ -112,26 +106,25 @@ def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(model, photos, 
     assert len(read.vertices) == told["vertices"] and len(read.faces) == told["faces"]
     assert told["trimmed"] > 2 / 48
     assert content != (tmp_path / "model" / "0" / "0.glb").read_bytes()
-    words = ["-m", model, str(photos / "0.png"), "-o", str(tmp_path / "o"), "--format", "obj", "--size", "32"]
-    assert main(["mesh", *words]) == 0
+    words = ["-o", tmp_path / "o", "--format", "obj", "--size", 32]
+    assert run("mesh", "-m", tiny, photos / "0.png", *words) == 0
     assert {file.suffix for file in (tmp_path / "o" / "0").iterdir()} == {".obj", ".mtl", ".png"}
 
 
-def test_decompose_at_another_size_with_a_sheet(model, photos, tmp_path):
+def test_decompose_at_another_size_with_a_sheet(tiny, photos, tmp_path):
     out = tmp_path / "out"
-    names = [str(photos / "0.png"), str(photos / "1.png")]
-    words = ["--size", "48", "--detail", "photo", "--sheet"]
-    assert main(["decompose", "-m", model, *names, "-o", str(out), *words]) == 0
+    words = ["--size", 48, "--detail", "photo", "--sheet"]
+    assert run("decompose", "-m", tiny, photos / "0.png", photos / "1.png", "-o", out, *words) == 0
     with np.load(out / "1" / "scene.npz") as scene:
         assert scene["depth"].shape == (48, 48) and scene["albedo"].shape == (3, 48, 48)
     with Image.open(out / "sheet.png") as sheet, Image.open(out / "0" / "albedo.png") as albedo:
         assert sheet.height > 2 * 128 and albedo.size == (48, 48)
 
 
-def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, numbers):
+def test_search_with_a_picture_of_the_table(table, tiny, photos, tmp_path, numbers):
     """It is not found itself, whatever its name, unless copies are asked for."""
     sheet, renamed = tmp_path / "sheet.png", shutil.copy(photos / "4.png", tmp_path / "mine.png")
-    words = ("search", "-f", table, "--like", renamed, "--model", model, "-k", "3", "--out", sheet)
+    words = ("search", "-f", table, "--like", renamed, "--model", tiny, "-k", "3", "--out", sheet)
     answer, printed = numbers(*words)
     assert answer["same_picture"] == ["4.png"] and len(answer["found"]) == 3
     assert "4.png" not in {row["file"] for row in answer["found"]}
@@ -146,19 +139,19 @@ def test_search_with_a_picture_of_the_table(table, model, photos, tmp_path, numb
         assert drawn.width > 4 * 160
 
 
-def test_bad_pictures_are_left_out_and_named(model, photos, tmp_path, capsys):
+def test_bad_pictures_are_left_out_and_named(tiny, photos, tmp_path, capsys):
     bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"no picture")
-    words = ["-m", model, str(bad), str(photos / "0.png"), "-o", str(tmp_path / "out"), "--size", "32"]
-    assert main(["mesh", *words]) == 2
+    words = ["-m", tiny, bad, photos / "0.png", "-o", tmp_path / "out", "--size", 32]
+    assert run("mesh", *words) == 2
     assert f"left out {bad}" in capsys.readouterr().err
     assert [folder.name for folder in (tmp_path / "out").iterdir()] == ["0"]
 
 
-def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers, monkeypatch):
+def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, monkeypatch):
     folder, out = Path(shutil.copytree(photos, tmp_path / "folder")), tmp_path / "out"
     (folder / "bad.jpg").write_bytes(b"no picture")
-    words = ("rotate", "-m", model, folder, "-o", out, "--size", 32, "--stills", 2, "--film", "none")
+    words = ("rotate", "-m", tiny, folder, "-o", out, "--size", 32, "--stills", 2, "--film", "none")
     told, printed = numbers(*words)  # exit code 0: of a folder the others are used
     assert len(told["pictures"]) == 6 and "left out" in printed and (out / "sheet.png").exists()
     sheet, write, left = (out / "sheet.png").read_bytes(), Edit.write, [1, 1, 1]
@@ -172,7 +165,7 @@ def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers,
 
     with monkeypatch.context() as stop:
         stop.setattr(Edit, "write", interrupted)
-        assert main([str(word) for word in words]) == 130
+        assert run(*words) == 130
     assert not (out / "sheet.png").exists() and len(list(out.glob("[0-9]"))) == 3
     numbers(*words, "--resume")
     assert (out / "sheet.png").read_bytes() == sheet and not (out / ".sheet").exists()  # with every picture
@@ -183,27 +176,27 @@ def test_a_folder_goes_on_where_it_was_stopped(model, photos, tmp_path, numbers,
     assert (out / "1" / "strip.png").stat().st_mtime_ns == kept
 
 
-def test_the_whole_photograph_is_written_unless_the_frame_is_asked_for(model, photos, tmp_path):
+def test_the_whole_photograph_is_written_unless_the_frame_is_asked_for(tiny, photos, tmp_path):
     wide = Image.new("RGB", (160, 96), (200, 30, 30))
     wide.paste(Image.open(photos / "0.png"), (48, 16))
     wide.save(tmp_path / "wide.png")
-    words = ["-m", model, str(tmp_path / "wide.png"), "--stills", "2", "--frames", "2", "--film", "mp4"]
-    assert main(["relight", *words, "-o", str(tmp_path / "whole")]) == 0
+    words = ["relight", "-m", tiny, tmp_path / "wide.png", "--stills", 2, "--frames", 2, "--film", "mp4"]
+    assert run(*words, "-o", tmp_path / "whole") == 0
     still = np.asarray(Image.open(tmp_path / "whole" / "wide" / "still-01.png").convert("RGB"))
     assert still.shape == (96, 160, 3) and (still[:, :2] == (200, 30, 30)).all()
     assert np.abs(still.astype(int) - np.asarray(wide)).max() > 20
-    assert main(["relight", *words, "-o", str(tmp_path / "frame"), "--only-frame", "--size", "48"]) == 0
+    assert run(*words, "-o", tmp_path / "frame", "--only-frame", "--size", 48) == 0
     with Image.open(tmp_path / "frame" / "wide" / "still-01.png") as frame:
         assert frame.size == (48, 48)
 
 
-def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
+def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
     one, out = photos / "0.png", tmp_path / "out"
-    given = ("-m", model, one, "-o", out)
+    given = ("-m", tiny, one, "-o", out)
     swap = ("swap", *given, "--from", photos / "1.png", "--factor")
     assert "unknown factor 'albdo'; did you mean 'albedo'" in refused(*swap, "albdo")
     assert "none.png does not exist" in refused("relight", *given, "--like", tmp_path / "none.png")
-    assert "holds no images" in refused("rotate", "-m", model, tmp_path, "-o", out)
+    assert "holds no images" in refused("rotate", "-m", tiny, tmp_path, "-o", out)
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
     assert "reach must be above 0" in refused("relight", *given, "--reach", "0")
     assert "size 16 is below the model's 32" in refused("relight", *given, "--size", "16")
@@ -211,27 +204,27 @@ def test_bad_questions_about_pictures(model, photos, tmp_path, refused):
     assert "unknown format 'gbl'; did you mean 'glb'" in refused("mesh", *given, "--format", "gbl")
     assert "unknown kind of film 'avi'" in refused("rotate", *given, "--film", "avi")
     assert not out.exists()
-    assert "is a file: name a folder to write to" in refused("mesh", "-m", model, one, "-o", one)
+    assert "is a file: name a folder to write to" in refused("mesh", "-m", tiny, one, "-o", one)
     (out / "0").mkdir(parents=True)
     assert "exists already: choose another --out, or add --force" in refused("mesh", *given)
     assert list((out / "0").iterdir()) == []
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user whom permissions bind")
-def test_a_folder_that_may_not_be_written(model, photos, tmp_path, refused):
+def test_a_folder_that_may_not_be_written(tiny, photos, tmp_path, refused):
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
-    assert "permission denied" in refused("mesh", "-m", model, photos / "0.png", "-o", locked / "out")
+    assert "permission denied" in refused("mesh", "-m", tiny, photos / "0.png", "-o", locked / "out")
 
 
-def test_bad_searches(table, model, photos, tmp_path, refused):
+def test_bad_searches(table, tiny, photos, tmp_path, refused):
     like = ("search", "-f", table, "--like")
     assert "unknown factor 'shape'" in refused(*like, "0.png", "--factor", "shape")
     assert "did you mean 'geometry'" in refused(*like, "0.png", "--factor", "geometri")
     assert "unknown metric 'l2'" in refused(*like, "0.png", "--metric", "l2")
     assert "has no row '9.png'" in refused(*like, "9.png")
     assert "to search with an image, add a model" in refused(*like, photos / "0.png")
-    assert "no.png is no image file" in refused(*like, tmp_path / "no.png", "--model", model)
+    assert "no.png is no image file" in refused(*like, tmp_path / "no.png", "--model", tiny)
     assert "ends in .png" in refused(*like, "0.png", "--out", tmp_path / "sheet.gif")
     taken = tmp_path / "taken.png"
     taken.write_bytes(b"mine")
@@ -246,29 +239,28 @@ def test_bad_searches(table, model, photos, tmp_path, refused):
     assert "holds none of the images found" in complaint and not (tmp_path / "s.png").exists()
 
 
-def test_pictures_unlike_what_the_model_was_validated_on_are_named(model, photos, tmp_path, capsys):
+def test_pictures_unlike_what_the_model_was_validated_on_are_named(tiny, photos, tmp_path, capsys):
     """Errors kept with a copy of the model decide which images are named; they never stop a command."""
-    known = Path(shutil.copytree(model, tmp_path / "known"))
+    known = Path(shutil.copytree(tiny, tmp_path / "known"))
     one, two = photos / "0.png", photos / "1.png"
     words = ["--size", "32", "--film", "none", "--stills", "2"]
-    for command in (["relight", *words], ["mesh", "--size", "32"], ["decompose"]):
-        name, *rest = command
-        assert main([name, "-m", model, str(one), "-o", str(tmp_path / f"no-{name}"), *rest]) == 0
+    for name, *rest in (["relight", *words], ["mesh", "--size", "32"], ["decompose"]):
+        assert run(name, "-m", tiny, one, "-o", tmp_path / f"no-{name}", *rest) == 0
         printed = capsys.readouterr().err
         assert "reconstructed worse" not in printed and "not in the crop" not in printed
-    write_errors(known, HeldOutErrors(np.linspace(0, 0.001, 101), 50))
+    write_errors(known, HeldOutErrors(pictures=50, quantiles=list(np.linspace(0, 0.001, 101))))
     told = tmp_path / "told.json"
-    words = ["--size", "32", "--from", str(two), "--factor", "light", "--json", str(told)]
-    assert main(["swap", "-m", str(known), str(one), "-o", str(tmp_path / "swapped"), *words]) == 0
+    words = ["--size", "32", "--from", two, "--factor", "light", "--json", told]
+    assert run("swap", "-m", known, one, "-o", tmp_path / "swapped", *words) == 0
     printed = capsys.readouterr().err
     assert "2 of 2 images are reconstructed worse than 99 % of those this model was validated on" in printed
     assert f"{one} is one" in printed
     assert json.loads(told.read_text())["reconstruction_percentile"] == {str(one): 100, str(two): 100}
-    write_errors(known, HeldOutErrors(np.linspace(0, 2, 101), 50))
-    assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "usual"), "--size", "32"]) == 0
+    write_errors(known, HeldOutErrors(pictures=50, quantiles=list(np.linspace(0, 2, 101))))
+    assert run("mesh", "-m", known, one, "-o", tmp_path / "usual", "--size", "32") == 0
     printed = capsys.readouterr().err
     assert "out-of-distribution" not in printed
     assert re.search(r"reconstructed worse than \d\d? % of the images this model was validated on", printed)
     (known / ERRORS_FILE).write_text("{")
-    assert main(["mesh", "-m", str(known), str(one), "-o", str(tmp_path / "damaged"), "--size", "32"]) == 0
+    assert run("mesh", "-m", known, one, "-o", tmp_path / "damaged", "--size", "32") == 0
     assert "cannot find out-of-distribution images" in capsys.readouterr().err

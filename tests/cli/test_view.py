@@ -54,10 +54,10 @@ def test_it_listens_on_this_machine_only(model, photos, served, tmp_path, capsys
     assert main([*words, "--json", str(told), "--keep", "7"]) == 0
     (application, place) = served[0]
     assert place[0] == "127.0.0.1"
-    viewer = application.viewer
-    assert [example.name for example in viewer.examples] == ["0.png"]
-    assert viewer.studio.shelf.limit == 7
-    assert len(viewer.gallery.table) == 3 and not viewer.gallery.without_pictures
+    studio = application.studio
+    assert [example.name for example in studio.examples] == ["0.png"]
+    assert studio.shelf.limit == 7
+    assert len(studio.gallery.table) == 3 and not studio.gallery.without_pictures
     assert json.loads(told.read_text())["url"] == f"http://127.0.0.1:{place[1]}/"
     printed = capsys.readouterr()
     assert f"open http://127.0.0.1:{place[1]}/" in printed.out

@@ -10,7 +10,7 @@ from derender.evaluation.image_scores import ImageResult, image_rows, image_verd
 from derender.evaluation.score_table import Column
 
 ERROR = np.random.default_rng(0).normal(1.0, 0.2, 400)
-ONE = {"error": (Column("error", "low"), 1.0), "good": (Column("good", "high"), 1.0)}
+ONE = {"error": Column("error", "low"), "good": Column("good", "high")}
 
 
 def test_lower_scores_are_better_by_the_controls_surplus():
@@ -38,7 +38,7 @@ def test_images_without_a_score_are_left_out():
 
 
 class Both(ImageResult):
-    columns: ClassVar = {"side": (Column("SIDE x 100", "low"), 100.0), "mad": (Column("MAD", "low", 1), 1.0)}
+    columns: ClassVar = {"side": Column("SIDE x 100", "low", scale=100), "mad": Column("MAD", "low", 1)}
     notes: ClassVar = {"plane": "flat"}
     caption, coverage = "{} images", Column("coverage")
 

@@ -14,7 +14,7 @@ from derender.cli import main
 from derender.photo import Face, Frame, find_faces
 from derender.photo.align import AFFINE, COLUMNS, _write
 from derender.photo.faces import RENDERED, UTKFACE, YAW_PER_SHARE
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 
 MODULE = sys.modules["derender.photo.align"]  # the package has the function by that name
 

@@ -45,10 +45,10 @@ def test_panel_has_the_expected_size_and_labels(monkeypatch):
     scene = bump()
     drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
     layout = GridLayout(cell=90, gap=10, margin=20, label=12)
-    one = drawn.panel(1, layout)
+    one = labelled_grid({name: images[1:2] for name, images in drawn.columns.items()}, layout=layout)
     assert written == list(COLUMN_MEANING)
     assert one.size == (20 + 8 * 90 + 7 * 10 + 20, 20 + 12 + 10 + 90 + 20)
-    sheet = drawn.sheet(["a.jpg", "b.jpg", "c.jpg"], layout)
+    sheet = labelled_grid(drawn.columns, ["a.jpg", "b.jpg", "c.jpg"], layout=layout)
     assert sheet.height == one.height + 2 * (90 + 10) and sheet.width > one.width
     assert {"a.jpg", "b.jpg", "c.jpg"} <= set(written)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.evaluation.disentanglement.conftest import card
 
-from derender.report.matrices import Matrix, card_matrices, matrix_sheet
+from derender.report.charts import Matrix, card_matrices, matrix_sheet
 
 
 def test_the_sheet_shows_every_matrix():

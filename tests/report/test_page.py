@@ -40,7 +40,7 @@ def full_page(text: str = "plain") -> str:
     """One of every block, with ``text`` wherever a text goes."""
     columns, rows = [Column(text, "high", note=text)], [Row(text, [0.5], note=text), Row("c", [text], True)]
     curves = charts.curves({text: ([0, 1], [2, 3])}, text, text)
-    bars = charts.bars({text: 1.0, "b": 2.0}, text, [text], (text, 0.5))
+    bars = charts.bars({text: 1.0, "b": 2.0}, text, [text])
     film = films.animated_png([picture(1), picture(2)])
     table = ScoreTable(text, text, columns, rows)
     values = {"text": text, "picture": picture(), "film": film, "table": table, "svgs": [curves, bars]}

@@ -90,7 +90,6 @@ def test_loops_move_and_close():
         (lambda: sweeps.lights_around(sweeps.stills(2), 90), "reach must lie between -90 and 90"),
         (lambda: sweeps.lights_around(sweeps.stills(2), 9, strength=-1), "strength of a light must be 0"),
         (lambda: sweeps.cameras_around(sweeps.stills(2), 10, 95), "pitch must lie between"),
-        (lambda: sweeps.varied(ball(), light=torch.zeros(2, 4), camera=torch.zeros(3, 6)), r"\[2, 3\]"),
         (lambda: sweeps.swapped(ball(), ball()[[0, 0]], "light"), "takes from one scene, got 2"),
         (lambda: sweeps.nodding_view(ball()[[0, 0]]), "one scene"),
     ],

@@ -60,6 +60,10 @@ def test_outermost_pixel_centres_span_the_field_of_view(height, width):
     assert (rays[..., 2] == 1).all()
 
 
+def test_focal_length_of_synface64():
+    assert pinhole.focal_px(64, 10.0) == pytest.approx(360.05, abs=0.005)
+
+
 @pytest.mark.parametrize(("height", "width"), [(6, 6), (5, 8), (9, 4)])
 def test_project_undoes_unproject(height, width, generator):
     depth = 0.5 + torch.rand(2, height, width, generator=generator, dtype=torch.float64)
@@ -86,3 +90,9 @@ def test_a_constant_is_made_once_for_each_kind_and_serves_gradients():
     factor = torch.ones(2, 2, dtype=torch.float64, requires_grad=True)
     (factor * first).sum().backward()
     assert factor.grad is not None and torch.equal(factor.grad, first)
+
+
+def test_translation_moves_right_down_and_away():
+    before = torch.tensor([[[0.02, 0.03, 1.05]]], dtype=torch.float64)
+    moved = pinhole.to_camera(before, camera(tx=0.1, ty=0.2, tz=0.3))
+    assert_agrees(moved - before, torch.tensor([[[0.1, 0.2, 0.3]]], dtype=torch.float64))

@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import interpolate
 
 import derender
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.scene.crop import WHOLE, Crop, best_crop, candidate_crops, crop_errors
 
 TRUE = Crop(0.7, 0.1, 0.2)

@@ -81,7 +81,7 @@ def test_a_pushed_model_comes_back_the_same_with_a_card(model, fake):
 
 def test_card_and_errors_go_with_the_weights_they_belong_to(model, tmp_path):
     first = model.save_pretrained(tmp_path / "first", **MINE)
-    write_errors(first, HeldOutErrors(np.linspace(0.01, 0.11, 101), 1234))
+    write_errors(first, HeldOutErrors(pictures=1234, quantiles=list(np.linspace(0.01, 0.11, 101))))
     loaded = derender.load(first)
     second = loaded.save_pretrained(tmp_path / "second")
     assert (second / "README.md").read_text() == (first / "README.md").read_text()

@@ -11,7 +11,7 @@ from derender.training import held_out_errors as kept
 
 
 def test_known_percentiles():
-    held_out = kept.HeldOutErrors(np.linspace(0.1, 0.2, 101), 101)
+    held_out = kept.HeldOutErrors(pictures=101, quantiles=list(np.linspace(0.1, 0.2, 101)))
     found = kept.percentile_of(np.array([0.0, 0.1, 0.15, 0.1985, 0.2, 9.0, np.inf]), held_out)
     assert found == pytest.approx([0, 0, 50, 98.5, 100, 100, 100])
 

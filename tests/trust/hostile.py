@@ -21,7 +21,7 @@ from hostile_files import Hostile, encoded, named_in, smooth, write_hostile, wri
 
 from derender.cli import main
 from derender.model import load
-from derender.report.viewer.app import Application, Viewer
+from derender.report.viewer.app import Application
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
@@ -109,7 +109,7 @@ def labelled(folder: Path, hostile: Hostile) -> int:
 def uploads(hostile: Hostile) -> list[str]:
     """Send every file to a viewer; gives what was answered otherwise than is due."""
     faults = []
-    with serving(Application(Viewer(Studio(load(MODEL), "m", Shelf(2))))) as url:
+    with serving(Application(Studio(load(MODEL), "m", Shelf(2)))) as url:
         server = urlsplit(url).netloc
         for file in (*hostile.readable, *hostile.unreadable):
             if (hostile.folder / file).is_file():

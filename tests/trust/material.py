@@ -18,7 +18,7 @@ from derender.features import FeatureTable
 from derender.model import Derenderer, load
 from derender.photo.video import write_video
 from derender.postprocess import Features
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.scene.perturb import PerturbSettings
 from derender.storage.atomic import check_seal
 from derender.training.config import WhiteningSettings, resolve, to_yaml

@@ -27,7 +27,7 @@ from kills import made_material
 from derender.features import embed_to_file
 from derender.learn import train
 from derender.model import load
-from derender.report.viewer.app import Application, Viewer
+from derender.report.viewer.app import Application
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
@@ -103,7 +103,7 @@ def soak(place: Path, minutes: float, clients: int, every_seconds: float, model:
             train(data, out=out, preset="small", settings=LEARNS, device="cpu", page=False)
 
     series: dict[str, list[float]] = {name: [] for name in BOUNDS}
-    with serving(Application(Viewer(Studio(net, "m", Shelf(8))))) as url:
+    with serving(Application(Studio(net, "m", Shelf(8)))) as url:
         works = [lambda: visit(url, image, done)] * clients
         works += [trained, lambda: embed_to_file(data, net, place / "F.parquet", fresh=True)]
         names = [*["visits"] * clients, "trainings", "tables"]

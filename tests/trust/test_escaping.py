@@ -103,5 +103,5 @@ def test_explanation(evil):
 
 
 def test_a_name_with_dollars_is_text_and_no_formula():
-    svg = charts.bars({"$\\frac$": 1.0, "cost $5 to $9": 2.0}, "x", ["$\\frac$"], ("$a_", 0.5))
+    svg = charts.bars({"$\\frac$": 1.0, "cost $5 to $9": 2.0}, "$a_", ["$\\frac$"])
     assert "$\\frac$" in svg and "cost $5 to $9" in svg and "$a_" in svg

@@ -1,17 +1,13 @@
 """`derender bench`: speed on this machine, as ratios of two things measured in turns in one run."""
 
-from typing import Annotated
-
-import typer
-
 from derender.cli import options
 from derender.cli.console import progress_bar, result, write_json
-from derender.cli.gathered import command
+from derender.cli.options import command, option
 
 
 @command("bench", "bench --quick --json speed.json")
 def bench(
-    quick: Annotated[bool, typer.Option("--quick", help="Smaller sizes and one round: a minute.")] = False,
+    quick: bool = option(False, "Smaller sizes and one round: a minute.", "--quick"),
     json_file: options.Json = None,
 ) -> None:
     """Measure speed on this machine, as ratios: rasteriser, embedding beside training, clustering."""

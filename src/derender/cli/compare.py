@@ -1,37 +1,30 @@
 """`derender compare`: one of the paper's tables for other features, or by plan many methods trained here."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated
-
-import typer
 
 from derender.cli import options, scoring
-from derender.cli.console import progress_bar
-from derender.cli.gathered import command
+from derender.cli.options import command, option
 from derender.cli.plan import Planned, by_plan
 
-TABLES = "clustering, identity, emotion, linear, segmentation or cars."
 FEATURES = "Table made by derender embed; a name given again is another seed."
-Features = typer.Option("--features", "-f", metavar="NAME=FILE.parquet", help=FEATURES)
-SUPERVISED = "With --finetune: also a ResNet-18 from fresh weights."
-Models = typer.Option("--model", "-m", help=f"Model, with IMAGES: {options.MODELS}", metavar="NAME=MODEL")
+MODELS = f"Model, with IMAGES: {options.MODELS}"
 
 
 @dataclass(frozen=True)
 class PaperTable:
     """One of the paper's tables."""
 
-    table: Annotated[str | None, typer.Option(help=TABLES)] = None
-    features: Annotated[list[str] | None, Features] = None
-    model: Annotated[list[str] | None, Models] = None
+    table: str | None = option(None, "clustering, identity, emotion, linear, segmentation or cars.")
+    features: list[str] | None = option(None, FEATURES, "--features", "-f", metavar="NAME=FILE.parquet")
+    model: list[str] | None = option(None, MODELS, "--model", "-m", metavar="NAME=MODEL")
     factors: scoring.Factors = "geometry,albedo"
     masks: scoring.Masks = None
     method: scoring.Method = "ward"
     counts: scoring.Counts = "100,500,1000"
-    seeds: Annotated[int, scoring.number(help="Number of training subsets; of runs of each net.")] = 5
-    epochs: Annotated[int, scoring.number(help="Epochs of segmentation nets.")] = 20
-    finetune: Annotated[bool, typer.Option("--finetune", help="Also train the models' encoders.")] = False
-    supervised: Annotated[bool, typer.Option("--supervised", help=SUPERVISED)] = False
+    seeds: int = scoring.number(5, "Number of training subsets; of runs of each net.")
+    epochs: int = scoring.number(20, "Epochs of segmentation nets.")
+    finetune: bool = option(False, "Also train the models' encoders.", "--finetune")
+    supervised: bool = option(False, "With --finetune: also a ResNet-18 from fresh weights.", "--supervised")
     untrained_seeds: scoring.UntrainedSeeds = 3
 
 
@@ -59,19 +52,13 @@ def compare(
         raise ValueError("--out, --workers, --minutes and --dry-run go with --plan FILE")
     if paper.table is None:
         raise ValueError("give --table NAME with --model or --features, or --plan FILE with --out DIR")
-    published.check()
-    from derender import evaluation
     from derender.features import FeatureTable
 
     tables = scoring.named_paths(paper.features or (), "--features")
     models = scoring.named_paths(paper.model or (), "--model")
     read = {name: list(map(FeatureTable.read, paths)) for name, paths in tables.items()}
-    with progress_bar("scoring") as progress:
-        scores = evaluation.compare(
-            paper.table, {**read, **models}, images.optional_address, **images.how, **vars(computed),
-            factors=scoring.names_of(paper.factors), masks=paper.masks, epochs=paper.epochs,
-            method=paper.method, counts=scoring.numbers_of(paper.counts, "--counts"), seeds=paper.seeds,
-            finetune=paper.finetune, supervised=paper.supervised, untrained_seeds=paper.untrained_seeds,
-            progress=progress,
-        )  # fmt: skip
-    published.publish(scores)
+    own = {name: value for name, value in vars(paper).items() if name not in ("table", "features", "model")}
+    own |= {"factors": scoring.names_of(paper.factors)}
+    own |= {"counts": scoring.numbers_of(paper.counts, "--counts")}
+    given = (paper.table, {**read, **models}, images.optional_address)
+    published.publish(scoring.measured("compare", *given, **images.how, **vars(computed), **own))

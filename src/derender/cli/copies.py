@@ -2,19 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from typer import Exit, Option
+from typer import Exit
 
-from derender.cli.console import notice, progress_bar, report_images
-from derender.cli.gathered import command
-from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
+from derender.cli.console import notice, progress_bar, refuse_existing, report_images
+from derender.cli.options import OutModel, Output, PartOfImages, Seed, Settings, TrainedModel, command, option
 from derender.cli.runs import DryRun, dry_run_shown
 
-SETTINGS = "Change a setting, as whitening.pictures=2000; the reference of settings lists all."
-Changes = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SETTINGS)]
 MEAN_ONLY = "Keep the model's own directions; take only the mean of its features from these images."
-MeanOnly = Annotated[bool, Option("--mean-only", help=MEAN_ONLY)]
 
 
 def copied(
@@ -27,7 +23,7 @@ def copied(
     if dry_run:
         dry_run_shown(learn.copy_settings(make.__name__, settings or ()), output.json_file)
         raise Exit
-    output.refuse_existing(out)
+    refuse_existing(out, output.force)
     with progress_bar(doing) as report:
         made = make(
             model.model, images.address, out=out, settings=settings or (), device=model.device,
@@ -40,8 +36,8 @@ def copied(
 
 @command("whiten", "whiten photos/ --model rendered-faces-64 --out mine")
 def whiten(
-    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Changes = None,
-    mean_only: MeanOnly = False, seed: Seed = 0, dry_run: DryRun = False,
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Settings = None,
+    mean_only: bool = option(False, MEAN_ONLY, "--mean-only"), seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model whose features move as little as possible with other factors.
 

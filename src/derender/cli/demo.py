@@ -3,25 +3,18 @@
 import time
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from derender.cli import options
 from derender.cli.console import duration, notice, progress_bar, result, show_scores, write_json
-from derender.cli.gathered import command
-
-Out = Annotated[
-    Path | None, typer.Option("--out", "-o", help="New folder for everything it makes.", metavar="DIR")
-]
-QUICK_HELP = "About one minute: to see that it runs, not how good it is."
+from derender.cli.options import command, option
 
 
 @command("demo", "demo --quick")
 def demo(
     images: options.Images = None,
-    out: Out = None,
-    quick: Annotated[bool, typer.Option("--quick", help=QUICK_HELP)] = False,
+    out: Path | None = option(None, "New folder for everything it makes.", "--out", "-o", metavar="DIR"),
+    quick: bool = option(False, "About one minute: to see that it runs, not how good it is.", "--quick"),
     seed: options.Seed = 0,
     json_file: options.Json = None,
 ) -> None:

@@ -1,24 +1,14 @@
 """`derender refine` and `unet`: copies of a model whose encoders learn from its own scenes."""
 
-from typing import Annotated
-
-from typer import Option
-
 from derender.cli.console import notice
 from derender.cli.copies import copied
-from derender.cli.gathered import command
-from derender.cli.options import OutModel, Output, PartOfImages, Seed, TrainedModel
+from derender.cli.options import OutModel, Output, PartOfImages, Seed, Settings, TrainedModel, command
 from derender.cli.runs import DryRun
-
-REFINING = "Change a setting, as images=50000 or reframed=0.85; the reference of settings lists all."
-UNETS = "Change a setting, as images=50000 or unet_width=32; the reference of settings lists all."
-Refining = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=REFINING)]
-UNets = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=UNETS)]
 
 
 @command("refine", "refine photos/ --model runs/mine --part train --out refined")
 def refine(
-    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Refining = None,
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Settings = None,
     seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
@@ -42,7 +32,7 @@ def refine(
 
 @command("unet", "unet photos/ --model faces-64 --out faces-unet")
 def unet(
-    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: UNets = None,
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Settings = None,
     seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model with U-Net encoders that learn its scenes pixel by pixel, without labels.

@@ -1,27 +1,24 @@
 """`derender doctor`: whether a folder suits the method, before anyone trains."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file
-from derender.cli.gathered import command
-from derender.cli.options import DataOptions, Output, Seed
+from derender.cli.options import DataOptions, Output, Seed, command, option
 
 WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}  # worst first
-CHECK = "Exit with 1 where the images do not suit the method."
-Check = Annotated[bool, typer.Option("--check", help=CHECK)]
-OUT = "Also write a page with example images."
 
 
 @command("doctor", "doctor photos/ --out doctor.html")
 def doctor(
     image_set: DataOptions,
     output: Output,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help=OUT, metavar="FILE.html")] = None,
+    out: Path | None = option(
+        None, "Also write a page with example images.", "--out", "-o", metavar="FILE.html"
+    ),
     seed: Seed = 0,
-    check: Check = False,
+    check: bool = option(False, "Exit with 1 where the images do not suit the method.", "--check"),
 ) -> None:
     """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing."""
     for file in (out, output.json_file):

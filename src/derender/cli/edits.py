@@ -2,30 +2,22 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from typer import Option
-
-from derender.cli.gathered import command
 from derender.cli.images import ImageFiles, opener_of
-from derender.cli.options import Output, TrainedModel
-from derender.report.opening import EDIT_SIZE, FilmOptions, ImageOptions, image_files
+from derender.cli.options import ImageModel, Output, command, option
+from derender.report.options import EDIT_SIZE, FilmOptions, ImageOptions
 
-Like = Annotated[Path | None, Option(help="Go to the lighting of this image.", metavar="IMAGE")]
-LightReach = Annotated[float, Option("--reach", help="Reach of the light to either side, in degrees.")]
-Height = Annotated[float, Option("--pitch", help="Height of the light, in degrees.")]
-Strength = Annotated[float, Option(min=0, max=10, help="Strength in multiples of the image's own.")]
-ViewReach = Annotated[float, Option("--reach", help="Rotation of the object to either side, in degrees.")]
-Nod = Annotated[float, Option("--pitch", help="Nod in degrees: the top comes forward.")]
-Source = Annotated[Path, Option("--from", help="Image to take from.", metavar="IMAGE")]
 FACTOR = "Factor to take; may be repeated. By default each in turn."
-Factors = Annotated[list[str] | None, Option("--factor", help=FACTOR, metavar="NAME")]
 
 
 @command("relight", "relight --model runs/faces me.jpg --like sunset.jpg --out relit/")
 def relight(
-    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, film: FilmOptions,
-    like: Like = None, reach: LightReach = 60.0, pitch: Height = 10.0, strength: Strength = 1.0,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
+    like: Path | None = option(None, "Go to the lighting of this image.", metavar="IMAGE"),
+    reach: float = option(60.0, "Reach of the light to either side, in degrees."),
+    pitch: float = option(10.0, "Height of the light, in degrees."),
+    strength: float = option(1.0, "Strength in multiples of the image's own.", min=0, max=10),
 ) -> None:  # fmt: skip
     """Write strips and films of images under other lighting: from right to left, or to that of --like.
 
@@ -44,8 +36,9 @@ def relight(
 
 @command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")
 def rotate(
-    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, film: FilmOptions,
-    reach: ViewReach = 40.0, pitch: Nod = 0.0,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
+    reach: float = option(40.0, "Rotation of the object to either side, in degrees."),
+    pitch: float = option(0.0, "Nod in degrees: the top comes forward."),
 ) -> None:  # fmt: skip
     """Write strips and films of images rotated from one side to the other, in their own lighting."""
     from derender.report.edits import rotated, rotated_video
@@ -57,12 +50,14 @@ def rotate(
 
 @command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")
 def swap(
-    files: ImageFiles, model: TrainedModel, how: ImageOptions, output: Output, source: Source,
-    factor: Factors = None,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output,
+    source: Path = option(..., "Image to take from.", "--from", metavar="IMAGE"),
+    factor: list[str] | None = option(None, FACTOR, metavar="NAME"),
 ) -> None:  # fmt: skip
     """Write images with one factor of another: its geometry, albedo, light or camera, each by itself."""
     from derender.photo import is_video
     from derender.report.edits import swappable, swapped_factors, swapped_video
+    from derender.report.opening import image_files
 
     opener = opener_of(model, how, EDIT_SIZE, whole=True)
     parameters = swappable(opener.model, factor or ())

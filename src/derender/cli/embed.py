@@ -2,46 +2,39 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
 
 from derender.baselines import BASELINES
 from derender.cli import options
 from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file, visible
-from derender.cli.gathered import command
+from derender.cli.options import command, option
 
 NAMES = ", ".join(BASELINES)
 SIDE = "Side of the images in pixels, where no network fixes it (64); e4e enlarges them to its own."
-Out = Annotated[Path, typer.Option("--out", "-o", help="The table to write.", metavar="FILE.parquet")]
-Model = Annotated[str | None, typer.Option("--model", "-m", help=options.MODELS, metavar="MODEL")]
+FEATURES = "Features of a baseline, separated by commas."
 KEEP = "Keep every one of identical images, as labelled sets need."
-Keep = Annotated[bool, typer.Option("--keep-duplicates", help=KEEP)]
-Engine = Annotated[str, typer.Option(help="local, or ray: on a cluster of Ray.", metavar="NAME")]
-Workers = Annotated[int | None, typer.Option(min=1, metavar="N", help="Number of Ray actors; default: 2.")]
-
-
-def _option(help: str, metavar: str = "N", **more: Any) -> Any:
-    return typer.Option(help=help, metavar=metavar, rich_help_panel="Baselines", **more)
+PANEL = {"rich_help_panel": "Baselines"}
 
 
 @dataclass(frozen=True)
 class BaselineOptions:
     """Another network or control in place of our model."""
 
-    baseline: Annotated[str | None, _option(f"Instead of our model: {NAMES}.", "NAME")] = None
-    features: Annotated[str | None, _option("Features of a baseline, separated by commas.", "A,B")] = None
-    image_size: Annotated[int | None, _option(SIDE, min=8)] = None
-    components: Annotated[int, _option("Numbers in pca and noise.", min=1)] = 64
-    seed: Annotated[int, _option("Seed of pca, noise and untrained.", min=0)] = 0
+    baseline: str | None = option(None, f"Instead of our model: {NAMES}.", metavar="NAME", **PANEL)
+    features: str | None = option(None, FEATURES, metavar="A,B", **PANEL)
+    image_size: int | None = option(None, SIDE, min=8, metavar="N", **PANEL)
+    components: int = option(64, "Numbers in pca and noise.", min=1, metavar="N", **PANEL)
+    seed: int = option(0, "Seed of pca, noise and untrained.", min=0, metavar="N", **PANEL)
 
 
 @command("embed", "embed photos/ --model runs/faces --out features.parquet")
 def embed(
-    images: options.PartOfImages, out: Out, baselines: BaselineOptions, output: options.Output,
-    model: Model = None, batch_size: options.BatchSize = 256, fit_steps: options.FitSteps = None,
-    keep_duplicates: Keep = False, device: options.Device = "auto", engine: Engine = "local",
-    workers: Workers = None,
+    images: options.PartOfImages, baselines: BaselineOptions, output: options.Output,
+    batch_size: options.BatchSize = 256, fit_steps: options.FitSteps = None, device: options.Device = "auto",
+    out: Path = option(..., "The table to write.", "--out", "-o", metavar="FILE.parquet"),
+    model: str | None = option(None, options.MODELS, "--model", "-m", metavar="MODEL"),
+    keep_duplicates: bool = option(False, KEEP, "--keep-duplicates"),
+    engine: str = option("local", "local, or ray: on a cluster of Ray.", metavar="NAME"),
+    workers: int | None = option(None, "Number of Ray actors; default: 2.", min=1, metavar="N"),
 ) -> None:  # fmt: skip
     """Write a feature table: file, one list column per factor, and the labels of the data set.
 

@@ -1,37 +1,25 @@
 """`derender finetune`: encoders trained by rendering and by labels at once."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated
-
-import typer
 
 from derender.cli import scoring
 from derender.cli.console import result
-from derender.cli.gathered import command
-from derender.cli.options import DataOptions, Device, Settings
+from derender.cli.options import DataOptions, Device, Settings, command, option
 from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run, run_progress
-
-LABEL = "Label column; several if each has two values."
-START = "Run or saved model to start from; else fresh weights."
-RENDERING = "Weight of the rendering objective; default 1."
-FACTORS = "Codes the head takes, with commas; default geometry,albedo."
-Labelled = Annotated[
-    int | None, typer.Option("--labelled", min=2, metavar="N", help="Use the labels of N training images.")
-]
 
 
 @dataclass(frozen=True)
 class Choices:
     """What is trained, from where, and how; named as in `derender.finetune`."""
 
-    labels: Annotated[list[str] | None, typer.Option("--label", "-l", help=LABEL)] = None
-    attributes: Annotated[bool, typer.Option("--attributes", help="Learn every yes/no label.")] = False
-    model: Annotated[str | None, typer.Option("--model", "-m", help=START)] = None
-    preset: Annotated[str | None, typer.Option("--preset", help="Preset of fresh weights.")] = None
-    weight: Annotated[float | None, typer.Option("--weight", help="Weight of the labels; default 1.")] = None
-    rendering_weight: Annotated[float | None, typer.Option("--rendering-weight", help=RENDERING)] = None
-    labelled: Labelled = None
-    factors: Annotated[str | None, typer.Option("--factors", help=FACTORS)] = None
+    labels: list[str] | None = option(None, "Label column; several if each has two values.", "--label", "-l")
+    attributes: bool = option(False, "Learn every yes/no label.", "--attributes")
+    model: str | None = option(None, "Run or saved model to start from; else fresh weights.", "--model", "-m")
+    preset: str | None = option(None, "Preset of fresh weights.")
+    weight: float | None = option(None, "Weight of the labels; default 1.")
+    rendering_weight: float | None = option(None, "Weight of the rendering objective; default 1.")
+    labelled: int | None = scoring.number(None, "Use the labels of N training images.", min=2)
+    factors: str | None = option(None, "Codes the head takes, with commas; default geometry,albedo.")
     settings: Settings = None
     resume: Resume = False
 
@@ -49,7 +37,6 @@ def finetune(
     from derender import learn
     from derender.evaluation.memory import memory_in
 
-    published.check()
     if dry_run:
         dry_run_shown(learn.finetune_settings(out, **vars(choices)), published.json_file)
         return

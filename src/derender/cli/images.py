@@ -1,6 +1,6 @@
 """Files, output and notes of the image commands: decompose, relight, rotate, swap, mesh.
 
-How an image is read and drawn is in report/opening.py; a new option of all these commands is one field there.
+How an image is read and drawn is in report/options.py; a new option of all these commands is one field there.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,12 +12,13 @@ import typer
 
 from derender.cli.console import notice, progress_bar
 from derender.cli.options import OutFolder, Output, TrainedModel
-from derender.report.opening import ImageOpener, ImageOptions, OpenedImage, held_out_errors
+from derender.report.options import ImageOptions
 from derender.storage.places import require_image
 
 if TYPE_CHECKING:
     from derender.photo.video import Edit as VideoEdit
     from derender.report.editing import Edited
+    from derender.report.opening import ImageOpener, OpenedImage
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,12 @@ class ImageFiles:
 
     def edit(
         self,
-        opener: ImageOpener,
+        opener: "ImageOpener",
         edit: "Callable[[OpenedImage], Edited]",
         output: Output,
         *,
         sheet: bool | None = None,
-        beside: Sequence[OpenedImage] = (),
+        beside: "Sequence[OpenedImage]" = (),
         video: "VideoEdit | None" = None,
     ) -> None:
         """Edit and write every image and report it; exit code 2 where one that was named cannot be read."""
@@ -61,7 +62,9 @@ class ImageFiles:
             raise typer.Exit(2)
 
 
-def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: Any) -> ImageOpener:
+def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: Any) -> "ImageOpener":
     """What opens images: the loaded model with the options."""
+    from derender.report.opening import ImageOpener, held_out_errors
+
     held_out = held_out_errors(model.model)
     return ImageOpener(model.open(), how, default_size=default_size, held_out=held_out, **more)

@@ -5,25 +5,24 @@ from typing import Annotated
 
 import typer
 
-from derender.cli.console import notice
-from derender.cli.gathered import command
-from derender.cli.options import OutModel, Output, Settings
+from derender.cli.console import notice, refuse_existing
+from derender.cli.options import OutModel, Output, Settings, command, option
 
 PRESETS = ("faces", "cats", "cars")
-PRESET = f"Kind of object it was trained on: {', '.join(PRESETS)}."
 Checkpoint = Annotated[Path, typer.Argument(help="The .pth file that unsup3d wrote.", metavar="CHECKPOINT")]
 
 
 @command("import", "import unsup3d.pth --preset faces --out imported/")
 def import_checkpoint(
     checkpoint: Checkpoint, out: OutModel, output: Output,
-    preset: Annotated[str, typer.Option("--preset", help=PRESET)] = "faces", settings: Settings = None,
+    preset: str = option("faces", f"Kind of object it was trained on: {', '.join(PRESETS)}."),
+    settings: Settings = None,
 ) -> None:  # fmt: skip
     """Write a derender model with the weights of an unsup3d checkpoint. Nothing in the file is run.
 
     With --set the ranges of its training are given where they differ, as translation_z=0.1 or fov_deg=10.
     """
-    output.refuse_existing(out)
+    refuse_existing(out, output.force)
     from derender.model import Derenderer
     from derender.networks.unsup3d import NETS
     from derender.presets import MODEL_PRESETS, named_preset

@@ -1,12 +1,7 @@
 """`derender models` and `pack`: the models that are bundled, and one of your own in fewer bytes."""
 
-from typing import Annotated
-
-import typer
-
-from derender.cli.console import notice, progress_bar, result, write_json
-from derender.cli.gathered import command
-from derender.cli.options import Json, OutModel, Output, PartOfImages, TrainedModel
+from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
+from derender.cli.options import Json, OutModel, Output, PartOfImages, TrainedModel, command, option
 
 
 @command("models", "models --json models.json")
@@ -21,14 +16,11 @@ def models(json_file: Json = None) -> None:
     write_json(json_file, {"models": rows})
 
 
-MAPS = "Storage of the large maps of features: bytes or float16."
-Maps = Annotated[str, typer.Option("--maps", help=MAPS, metavar="KIND")]
-
-
 @command("pack", "pack photos/ --model runs/mine --out mine")
 def pack(
-    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, maps: Maps = "bytes"
-) -> None:
+    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output,
+    maps: str = option("bytes", "Storage of the large maps of features: bytes or float16.", metavar="KIND"),
+) -> None:  # fmt: skip
     """Write a copy of a model in fewer bytes: weights in float16, large maps in bytes or float16.
 
     Card, held-out errors and split are copied. With images, the loss of quality is measured on them.
@@ -37,7 +29,7 @@ def pack(
     from derender.inputs import as_model, copy_split
     from derender.storage.sharing import pack_model
 
-    output.refuse_existing(out)
+    refuse_existing(out, output.force)
     original, chosen = model.open(), None
     if images.optional_address is not None:
         chosen = images.read(original.image_size, model=model.model, at_least=2)

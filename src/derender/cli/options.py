@@ -1,16 +1,22 @@
-"""Options that several commands share, each declared once; groups of them are dataclasses (gathered.py).
+"""Commands, and the options that several of them share, each declared once.
 
-A group knows how to do what its options ask for: a new option of every command that reads images is one field
-here, used in one method here.
+Groups of options are dataclasses. A command that asks for such a dataclass is shown to typer with the fields
+in its place, and called with the value. What typer shows of a field or an argument is its annotation or an
+``option`` (``report/options.py``). A group knows how to do what its options ask for: a new option of every
+command that reads images is one field here, used in one method here.
 """
 
-from dataclasses import dataclass
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from derender.cli.console import progress_bar, refuse_existing, report_images, result, write_json
+from derender.cli.console import progress_bar, report_images, result, write_json
+from derender.report.options import option
 from derender.storage.places import (
     DEVICES,
     bundled_models,
@@ -34,16 +40,13 @@ BATCH = "Images per batch; changes speed and memory only."
 PART = "all, or the train, validation or test part of the model's training split."
 SEED = "Seed of every random choice: sampling, splits, initial weights."
 FIT = "Optimise each scene against its image by rendering, in N steps (60, say; slow)."
-SETTING = "Change one setting; may be repeated."
+SETTING = "Change one setting; may be repeated. The reference of settings lists all."
 Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
 Images = Annotated[str | None, typer.Argument(help=IMAGES, metavar="IMAGES", show_default=False)]
-DataAlias = Annotated[str | None, typer.Option("--data", "-d", hidden=True, metavar="IMAGES")]
 Dataset = Annotated[str, typer.Option("--dataset", help=DATASET, metavar="NAME")]
 Json = Annotated[str | None, typer.Option("--json", help=JSON, metavar="FILE")]
 Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help=LIMIT)]
-Half = Annotated[Literal["all", "development", "test"], typer.Option("--half", help=HALF)]
 BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help=BATCH)]
-Part = Annotated[str, typer.Option("--part", help=PART)]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help=SEED)]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
@@ -53,16 +56,58 @@ FitSteps = Annotated[int | None, typer.Option("--fit-steps", min=0, max=10_000, 
 Settings = Annotated[list[str] | None, typer.Option("--set", help=SETTING, metavar="KEY=VALUE")]
 
 
+def command(name: str, example: str) -> Callable[[Callable[..., None]], Any]:
+    """Decorate a ``gathered`` command: it gets ``register``, which puts it under its name into an app."""
+
+    def decorated(function: Callable[..., None]) -> Callable[..., None]:
+        run: Any = gathered(function)
+        run.register = lambda app: app.command(name, epilog=f"Example: derender {example}")(run)
+        return run
+
+    return decorated
+
+
+def gathered(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the fields of its dataclass parameters in their place, all given by name."""
+    groups: dict[str, type] = {}
+    shown: list[inspect.Parameter] = []
+
+    def show(name: str, kind: Any, default: Any) -> None:
+        if isinstance(default, Field):
+            if words := dict(default.metadata):
+                kind = Annotated[kind, typer.Option(*words.pop("names"), **words)]
+            default = inspect.Parameter.empty if default.default is MISSING else default.default
+        how = {"default": default, "annotation": kind}
+        shown.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **how))
+
+    for name, parameter in inspect.signature(command).parameters.items():
+        kind = parameter.annotation
+        if isinstance(kind, type) and is_dataclass(kind):
+            groups[name] = kind
+            for field in fields(kind):
+                show(field.name, field.type, field)
+        else:
+            show(name, kind, parameter.default)
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        taken = {
+            name: group(**{field.name: given.pop(field.name) for field in fields(group)})
+            for name, group in groups.items()
+        }
+        command(**given, **taken)
+
+    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+    return run
+
+
 @dataclass(frozen=True)
 class Output:
     """Where numbers go, and whether existing files are replaced."""
 
     force: Force = False
     json_file: Json = None
-
-    def refuse_existing(self, path: Path) -> None:
-        """Stop before any work where ``path`` exists, unless --force was given."""
-        refuse_existing(path, self.force)
 
     def result(self, text: str) -> None:
         """Print one line of result."""
@@ -78,10 +123,10 @@ class DataOptions:
     """The images of a command: one data set, by address."""
 
     images: Images = None
-    data: DataAlias = None
+    data: str | None = option(None, None, "--data", "-d", hidden=True, metavar="IMAGES")
     dataset: Dataset = "auto"
     limit: Limit = None
-    half: Half = "all"
+    half: Literal["all", "development", "test"] = option("all", HALF)
 
     @property
     def optional_address(self) -> str | None:
@@ -120,7 +165,7 @@ class DataOptions:
 class PartOfImages(DataOptions):
     """The images of a command, or one part of a training split."""
 
-    part: Part = "all"
+    part: str = option("all", PART)
 
     def __post_init__(self) -> None:
         if (address := self.optional_address) is not None and self.dataset == "auto":
@@ -151,18 +196,23 @@ class TrainedModel:
 
 
 @dataclass(frozen=True)
+class ImageModel(TrainedModel):
+    """The trained model of a command for photographs."""
+
+    model: Model = "faces-64"
+
+
+@dataclass(frozen=True)
 class GeneratedOptions:
     """The options of both kinds of generated images."""
 
     out: OutFolder
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Number of images (1000).")] = None
-    image_size: Annotated[int, typer.Option(min=16, max=1024, help="Width and height in pixels.")] = 64
+    count: int | None = option(None, "Number of images (1000).", "--count", "-n", min=1)
+    image_size: int = option(64, "Width and height in pixels.", min=16, max=1024)
     seed: Seed = 0
-    light: Annotated[str, typer.Option(help="Range of lighting: usual, wide, frontal.")] = "usual"
-    view: Annotated[str, typer.Option(help="Range of viewpoints: usual, wide, frontal.")] = "usual"
-    truth: Annotated[bool, typer.Option(help="Write the maps of ground truth too.")] = True
-    benchmark: Annotated[
-        bool, typer.Option("--benchmark", help="Write the fixed sets of published scores.")
-    ] = False
+    light: str = option("usual", "Range of lighting: usual, wide, frontal.")
+    view: str = option("usual", "Range of viewpoints: usual, wide, frontal.")
+    truth: bool = option(True, "Write the maps of ground truth too.")
+    benchmark: bool = option(False, "Write the fixed sets of published scores.", "--benchmark")
     overrides: Settings = None
     json_file: Json = None

@@ -3,31 +3,25 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
 
 from derender.cli.console import notice, progress_bar, result, show_scores, write_json
+from derender.cli.options import option
 
 PLAN = "YAML or TOML file of methods and data sets to compare."
 OUT = "Folder of --plan for runs, tables and charts; resumed."
-WORKERS = "Number of jobs of --plan at a time."
 MINUTES = "Minutes after which --plan scores what is finished."
-
-
-def _option(*names: str, **how: Any) -> Any:
-    return typer.Option(*names, rich_help_panel="Many methods on many data sets", **how)
+PANEL = {"rich_help_panel": "Many methods on many data sets"}
 
 
 @dataclass(frozen=True)
 class Planned:
     """The options of a comparison by plan."""
 
-    plan: Annotated[Path | None, _option("--plan", metavar="FILE", help=PLAN)] = None
-    out: Annotated[Path | None, _option("--out", "-o", metavar="DIR", help=OUT)] = None
-    workers: Annotated[int, _option("--workers", min=1, metavar="N", help=WORKERS)] = 1
-    minutes: Annotated[float | None, _option("--minutes", min=0, metavar="M", help=MINUTES)] = None
-    dry_run: Annotated[bool, _option("--dry-run", help="List the jobs of --plan, and stop.")] = False
+    plan: Path | None = option(None, PLAN, metavar="FILE", **PANEL)
+    out: Path | None = option(None, OUT, "--out", "-o", metavar="DIR", **PANEL)
+    workers: int = option(1, "Number of jobs of --plan at a time.", min=1, metavar="N", **PANEL)
+    minutes: float | None = option(None, MINUTES, min=0, metavar="M", **PANEL)
+    dry_run: bool = option(False, "List the jobs of --plan, and stop.", "--dry-run", **PANEL)
 
 
 def by_plan(planned: Planned, device: str, json_file: str | None) -> None:

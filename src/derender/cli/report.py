@@ -7,22 +7,18 @@ import typer
 
 from derender.cli import options
 from derender.cli.console import notice, progress_bar, refuse_existing_file
-from derender.cli.gathered import command
-from derender.cli.options import Output
+from derender.cli.options import Output, command, option
 
 Run = Annotated[Path, typer.Argument(help="Folder made by derender train.", metavar="RUN")]
-TRUTH = "Rendered images with exact depth, to score geometry."
-Truth = Annotated[str | None, typer.Option("--truth", help=TRUTH, metavar="PATH")]
 LABEL = "Label to explain by factors. By default the first suitable one."
-Labels = Annotated[list[str] | None, typer.Option("--label", "-l", help=LABEL)]
-OUT = "By default RUN/report.html, made anew."
-OutPage = Annotated[Path | None, typer.Option("--out", "-o", help=OUT, metavar="FILE")]
 
 
 @command("report", "report runs/faces photos/ --out faces.html")
 def report(
-    run: Run, images: options.DataOptions, output: Output, truth: Truth = None, label: Labels = None,
-    out: OutPage = None, device: options.Device = "auto",
+    run: Run, images: options.DataOptions, output: Output, device: options.Device = "auto",
+    truth: str | None = option(None, "Rendered images with exact depth, to score geometry.", metavar="PATH"),
+    label: list[str] | None = option(None, LABEL, "--label", "-l"),
+    out: Path | None = option(None, "By default RUN/report.html, made anew.", "--out", "-o", metavar="FILE"),
 ) -> None:  # fmt: skip
     """Make the page of a run again, from its folder; with images also films, scores and explanations.
 

@@ -1,4 +1,4 @@
-"""Option groups of the commands that score features, and where their tables go (gathered.py)."""
+"""Option groups of the commands that score features, and where their tables go."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,34 +7,34 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from typer import Option
 
 from derender.cli import options
 from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores, write_json
+from derender.cli.options import option
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureSource
     from derender.evaluation.memory import Memory
     from derender.evaluation.score_table import Scores
 
-number = partial(typer.Option, min=1, metavar="N")
+number = partial(option, min=1, metavar="N")
 """An option that takes a whole number, 1 or more."""
-share = partial(typer.Option, min=0.01, max=0.99)
-target = partial(typer.Option, metavar="FILE")
+share = partial(option, min=0.01, max=0.99)
+target = partial(option, None, metavar="FILE")
 
 Method = Annotated[Literal["ward", "finch", "k-means"], typer.Option(help="Clustering method.")]
 Factors = Annotated[str, typer.Option(help="Features to use, with commas between, or all.")]
 Counts = Annotated[str, typer.Option(help="Numbers of labelled rows to learn from, with commas between.")]
-UntrainedSeeds = Annotated[int, number(help="Number of untrained encoders averaged.")]
-Resamples = Annotated[int, number(min=2, help="Number of bootstrap resamples of the rows.")]
+UNTRAINED = "Number of untrained encoders averaged."
+UntrainedSeeds = Annotated[int, typer.Option(min=1, metavar="N", help=UNTRAINED)]
+RESAMPLES = "Number of bootstrap resamples of the rows."
+Resamples = Annotated[int, typer.Option(min=2, metavar="N", help=RESAMPLES)]
 GROUPS = "Label whose rows stay on one side of the split, as identity."
 Groups = Annotated[str | None, typer.Option(help=GROUPS)]
 CACHE = "Folder of cached results, or none; default: the user's."
 Cache = Annotated[str | None, typer.Option(metavar="DIR", help=CACHE)]
 MASKS = "Folder or zip of masks named as the images, if they lie apart."
 Masks = Annotated[str | None, typer.Option(metavar="PATH", help=MASKS)]
-LABEL = "Label column; repeated: mean over yes/no labels."
-FEATURES = "Table made by derender embed."
 MODEL = f"Instead of --features, with IMAGES. {options.MODELS}"
 WHITEN_ON = (
     "Also score the codes without whitening, and controls whitened by the model's renderings of these images "
@@ -46,20 +46,22 @@ WHITEN_ON = (
 class Labels:
     """The labels of a score, and the rows that carry them."""
 
-    label: Annotated[list[str] | None, typer.Option("--label", "-l", help=LABEL)] = None
-    attributes: Annotated[bool, typer.Option("--attributes", help="Score by every yes/no label.")] = False
-    min_count: Annotated[int, number(help="Leave out classes of fewer rows.")] = 1
-    max_count: Annotated[int | None, number(help="Use at most N rows of a class.")] = None
+    label: list[str] | None = option(
+        None, "Label column; repeated: mean over yes/no labels.", "--label", "-l"
+    )
+    attributes: bool = option(False, "Score by every yes/no label.", "--attributes")
+    min_count: int = number(1, "Leave out classes of fewer rows.")
+    max_count: int | None = number(None, "Use at most N rows of a class.")
 
 
 @dataclass(frozen=True)
 class ScoredSubject:
     """The features that are scored: one table or one model."""
 
-    features: Annotated[str | None, Option("--features", "-f", metavar="FILE.parquet", help=FEATURES)] = None
-    model: Annotated[str | None, Option("--model", "-m", help=MODEL)] = None
+    features: str | None = target("Table made by derender embed.", "--features", "-f", metavar="FILE.parquet")
+    model: str | None = option(None, MODEL, "--model", "-m")
     factors: Factors = "geometry,albedo"
-    whiten_on: Annotated[str | None, Option(metavar="PATH", help=WHITEN_ON)] = None
+    whiten_on: str | None = option(None, WHITEN_ON, metavar="PATH")
 
     def source(self, images: options.DataOptions) -> "FeatureSource":
         """The table, or the half of it that was asked for, or the model."""
@@ -95,20 +97,23 @@ class Published:
     """Where tables go besides the terminal."""
 
     json_file: options.Json = None
-    markdown: Annotated[str | None, target(help="Also write the tables as Markdown.")] = None
-    latex: Annotated[str | None, target(help="Also write the tables as LaTeX (booktabs).")] = None
-    html: Annotated[str | None, target(help="Also write the tables and charts as one page.")] = None
+    markdown: str | None = target("Also write the tables as Markdown.")
+    latex: str | None = target("Also write the tables as LaTeX (booktabs).")
+    html: str | None = target("Also write the tables and charts as one page.")
     force: options.Force = False
 
-    def check(self, out: Path | None = None, forms: Sequence[str] = ()) -> None:
-        """Refuse, before anything is computed, to write over tables and drawings, and into folders."""
+    def __post_init__(self) -> None:
+        """Refuse, before anything is computed, to write over tables, and into folders."""
+        for file in (self.markdown, self.latex, self.html, self.json_file):
+            if file not in (None, "-"):
+                refuse_existing_file(Path(file), self.force or file == self.json_file)
+
+    def check_drawing(self, out: Path | None, forms: Sequence[str]) -> None:
+        """Refuse to write over a drawing, and to draw in another form."""
         if out is not None:
             if out.suffix.lower() not in forms:
                 raise ValueError(f"--out {out} must end in {', '.join(forms)}: the kind of drawing")
             refuse_existing_file(out, self.force)
-        for file in (self.markdown, self.latex, self.html, self.json_file):
-            if file not in (None, "-"):
-                refuse_existing_file(Path(file), self.force or file == self.json_file)
 
     def publish(
         self, scores: "Scores", memory: "Memory | None" = None, what: str = "results", **values: Any
@@ -139,19 +144,20 @@ class Published:
             notice(f"page {page.write(self.html)}")
 
 
+def measured(protocol: str, *given: Any, doing: str = "scoring", unit: str = "images", **how: Any) -> Any:
+    """The scores by a protocol of `derender.evaluation`, with a progress bar."""
+    from derender import evaluation
+
+    with progress_bar(doing, unit) as progress:
+        return getattr(evaluation, protocol)(*given, **how, progress=progress)
+
+
 def score(
     protocol: str, published: Published, images: options.DataOptions, subject: ScoredSubject, **how: Any
 ) -> None:
     """Score features by a protocol of `derender.evaluation`, and publish."""
-    from derender import evaluation
-
-    published.check()
-    with progress_bar("scoring") as progress:
-        scores = getattr(evaluation, protocol)(
-            subject.source(images), images=images.optional_address, **images.how, **subject.how, **how,
-            progress=progress,
-        )  # fmt: skip
-    published.publish(scores, half=images.half)
+    how |= {"images": images.optional_address, **images.how, **subject.how}
+    published.publish(measured(protocol, subject.source(images), **how), half=images.half)
 
 
 def names_of(text: str) -> tuple[str, ...] | None:

@@ -1,32 +1,27 @@
 """`derender search`: the images of a table nearest to one image by one factor."""
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from derender.cli import options
 from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores
-from derender.cli.gathered import command
+from derender.cli.options import command, option
 
 LABELS_SHOWN = 4
-Table = Annotated[str, typer.Option("--features", "-f", help="A table of derender embed.", metavar="FILE")]
-Like = Annotated[str, typer.Option(help="An image, or the file name of a row of the table.", metavar="IMAGE")]
-Factor = Annotated[str, typer.Option(help="Factor that has to be alike.", metavar="NAME")]
-Count = Annotated[int, typer.Option("-k", min=1, metavar="N", help="Number of rows to find.")]
-Metric = Annotated[str, typer.Option(help="Distance: cosine or euclidean.", metavar="NAME")]
-Copies = Annotated[bool, typer.Option("--copies", help="Find the image itself too, and copies of it.")]
-Maker = Annotated[str | None, typer.Option("--model", "-m", help="Model of the table.", metavar="MODEL")]
-Sheet = Annotated[Path | None, typer.Option("--out", "-o", help="Also draw the result.", metavar="FILE.png")]
-ADDRESS = "New address of the table's images."
-Images = Annotated[str | None, typer.Option("--data", "-d", help=ADDRESS, metavar="IMAGES")]
 
 
 @command("search", "search --features F.parquet --like a.jpg --model runs/faces --factor geometry")
 def search(
-    features: Table, like: Like, output: options.Output, factor: Factor = "geometry", k: Count = 12,
-    metric: Metric = "cosine", copies: Copies = False, model: Maker = None, out: Sheet = None,
-    data: Images = None, dataset: options.Dataset = "auto", device: options.Device = "auto",
+    output: options.Output,
+    features: str = option(..., "A table of derender embed.", "--features", "-f", metavar="FILE"),
+    like: str = option(..., "An image, or the file name of a row of the table.", metavar="IMAGE"),
+    factor: str = option("geometry", "Factor that has to be alike.", metavar="NAME"),
+    k: int = option(12, "Number of rows to find.", "-k", min=1, metavar="N"),
+    metric: str = option("cosine", "Distance: cosine or euclidean.", metavar="NAME"),
+    copies: bool = option(False, "Find the image itself too, and copies of it.", "--copies"),
+    model: str | None = option(None, "Model of the table.", "--model", "-m", metavar="MODEL"),
+    out: Path | None = option(None, "Also draw the result.", "--out", "-o", metavar="FILE.png"),
+    data: str | None = option(None, "New address of the table's images.", "--data", "-d", metavar="IMAGES"),
+    dataset: options.Dataset = "auto", device: options.Device = "auto",
 ) -> None:  # fmt: skip
     """Find the same geometry under any lighting, the same lighting on anything: nearest by one factor."""
     if out is not None:

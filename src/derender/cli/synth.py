@@ -1,12 +1,11 @@
 """`derender synth`: rendered images with exact depth, normals, albedo, parts, light and camera."""
 
-from typing import Annotated, Any
+from typing import Any
 
-from typer import Option, Typer
+from typer import Typer
 
 from derender.cli.console import progress_bar, result, write_json
-from derender.cli.gathered import command
-from derender.cli.options import GeneratedOptions
+from derender.cli.options import GeneratedOptions, command, option
 
 
 def generate(
@@ -39,11 +38,11 @@ def generate(
 @command("faces", "synth faces --out made/ --count 500 --light wide")
 def faces(
     request: GeneratedOptions,
-    identities: Annotated[int | None, Option(min=1, help="Number of people; default: 8 images each.")] = None,
-    tracks: Annotated[int, Option(min=0, help="Number of sequences of each person, instead of images.")] = 0,
-    frames: Annotated[int, Option(min=1, help="Number of images in a sequence.")] = 6,
-    expressions: Annotated[str, Option(metavar="A,B", help="Only these expressions; default: all.")] = "",
-    model: Annotated[str | None, Option(metavar="FILE", help="Morphable model (.npz) to use.")] = None,
+    identities: int | None = option(None, "Number of people; default: 8 images each.", min=1),
+    tracks: int = option(0, "Number of sequences of each person, instead of images.", min=0),
+    frames: int = option(6, "Number of images in a sequence.", min=1),
+    expressions: str = option("", "Only these expressions; default: all.", metavar="A,B"),
+    model: str | None = option(None, "Morphable model (.npz) to use.", metavar="FILE"),
 ) -> None:
     """Generate faces with ground truth; the folder reads back as data for training and for evaluation."""
     if tracks and request.count is not None:
@@ -58,7 +57,7 @@ def faces(
 @command("cars", "synth cars --out made/ --classes police,jeep")
 def cars(
     request: GeneratedOptions,
-    classes: Annotated[str, Option(metavar="A,B", help="Only these classes; default: all twelve.")] = "",
+    classes: str = option("", "Only these classes; default: all twelve.", metavar="A,B"),
 ) -> None:
     """Generate cars of twelve classes with ground truth; the folder reads back as the layout syncar."""
     names = [f"classes=[{classes}]"] if classes else []

@@ -1,13 +1,11 @@
 """From any source to one array of decoded images with their labels: ``read_images``; and its split.
 
 A stream of samples is decoded in order on every core. What is known to fit lies in memory. Everything else is
-appended to a cache file, decoded once, and mapped into memory: training has random access. Besides its
-pixels, an image takes its name, its labels and about 200 bytes that find copies.
+appended to a cache file, decoded once, and mapped into memory: training has random access.
 
 A split into train, validation and test is the same on every machine. Files are put in the order of a hash of
-their name and the seed, and that order is cut: it depends on neither the file system nor a random generator's
-version, and counts are exact. An image added later moves only those few that lie at a cut. With groups
-(identities), whole groups are ordered and cut: no person is on two sides.
+their name and the seed, and that order is cut. An image added later moves only those few that lie at a cut.
+With groups (identities), whole groups are ordered and cut: no person is on two sides.
 """
 
 import hashlib

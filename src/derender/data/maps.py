@@ -4,11 +4,9 @@ Masks are only ever resized to the nearest value, after the same crop as their i
 merged as CelebAMask-HQ's owners do it (their g_mask.py): a later class hides an earlier one. Leaves out
 colours as classes, and a number for pixels without a class.
 
-Exact maps are in the camera frame of their image (conventions.md). A params.csv means: depth is z = 0.8 +
-value / 65535 * 0.4, normals (n + 1) / 2 * 255, albedo 0..255, and value 0 is background. Depth maps alone
-(unsup3d's synthetic faces) are grey: a share v of the largest value is z = 1.1 - 0.2 v, and 0 is background.
-The set does not state this, and it is untested on the archive. Look at the average depth first, for which
-unsup3d gives SIDE 1.990e-2 and MAD 23.26 degrees.
+Exact maps are in the camera frame of their image (conventions.md). With a params.csv depth is z = 0.8 + value
+/ 65535 * 0.4, normals (n + 1) / 2 * 255. 0 is background. Of depth maps alone (unsup3d's synthetic faces) a
+share v of the largest value is z = 1.1 - 0.2 v. The set does not state this; data-sets.md has a check.
 """
 
 import io

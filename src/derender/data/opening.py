@@ -1,10 +1,9 @@
 """From what the user wrote to a stream of images; zip archives are read in place.
 
-A path (of a folder, a zip, an image, a table of paths) may be followed by ``::PART``: a part of the
-official split or any folder. Streams are ``shards-{000..009}.tar``, a ``.tar``, a folder of them,
-``owner/name`` of a Hugging Face data set, and a folder or ``.parquet`` in its library's form. They are read
-from front to back and take ``?column=NAME`` (also ``config``, ``revision``) before ``::PART``; others take
-``?half=test`` or ``?half=development`` (``half_of``). A path that exists is always a path.
+A path may be followed by ``::PART``: a part of the official split or any folder. Streams (shards, and data
+sets of Hugging Face's library) are read from front to back. They take ``?column=NAME`` (also ``config``,
+``revision``) before ``::PART``; others take ``?half=test`` or ``?half=development``. A path that exists is
+always a path.
 
 Members of a zip with absolute names or ``..`` in them and encrypted ones are passed over and listed. Refused
 are another size or CRC-32 than in the directory, and a size beyond ``FILE_LIMIT_BYTES``. So is a member that

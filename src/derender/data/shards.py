@@ -1,9 +1,9 @@
 """WebDataset: tar files whose members belong together where their names agree up to the first dot.
 
-``0001.jpg`` and ``0001.json`` are one sample. A ``.cls`` becomes the label ``class`` (as text). Texts,
-numbers and yes/no values of a ``.json`` object become labels of their own; lists, objects and other members
-are passed over unread. Shards are read from front to back, and nothing is ever extracted, so no name in them
-can do harm. A damaged shard gives what was read before the damage, then one unreadable sample that says so.
+A ``.cls`` becomes the label ``class`` (as text). Texts, numbers and yes/no values of a ``.json`` object
+become labels of their own; other members are passed over unread. Nothing is ever extracted, so no name in a
+shard can do harm. A damaged shard gives what was read before the damage, then one unreadable sample that says
+so.
 
 Source: the format as described at https://github.com/webdataset/webdataset; read with Python's tarfile.
 """

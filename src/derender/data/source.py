@@ -1,13 +1,12 @@
 """Named files that are read by name: the interface of folders, zips, tables and single images; and folders.
 
 Names are posix paths relative to the source, sorted. Nothing is ever extracted, so that no name in an archive
-can write anywhere. Nested archives are not opened. A folder is walked once: hidden files and ``__MACOSX`` are
-left out, and links are followed, each real folder once, so that loops end.
+can write anywhere. A folder is walked once: hidden files and ``__MACOSX`` are left out, and links are
+followed, each real folder once, so that loops end.
 
-A parquet file is opened only if what its footer claims can be. Readers reserve memory for as many rows as the
-footer names: one changed byte of a file of 2 kB can ask for 18 GB. Leaves out the pages behind the footer and
-the columns of single row groups: of a damaged footer pyarrow 26 looks at those with C++ exceptions that end
-the process.
+A parquet file is opened only if what its footer claims can be: readers reserve memory for as many rows as it
+names. Leaves out the pages behind the footer and the columns of single row groups: of a damaged footer
+pyarrow 26 looks at those with C++ exceptions that end the process.
 """
 
 import os

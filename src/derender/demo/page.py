@@ -16,6 +16,7 @@ from derender import __version__
 from derender.data import as_float
 from derender.demo.story import BUNDLED, STAGES, DemoResult
 from derender.evaluation.depth import predicted_depth
+from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import ScoreTable
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
@@ -24,7 +25,7 @@ from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.evidence import looping_films
 from derender.report.page import DIRECTIONS, Page
 from derender.report.run import loss_charts
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS
 from derender.training.run_folder import read_metrics
@@ -133,7 +134,7 @@ def _beside(models: Mapping[str, Derenderer], images: Pixels) -> dict[str, colou
 
 
 def _beside_truth(result: DemoResult, rows: np.ndarray) -> dict[str, colours.Images]:
-    truth, model = result.truth, result.optimised
+    truth, model = result.truth, optimised(result.model, result.settings.fit_steps)
     images, mask = truth.images[rows], truth.mask[rows]
     depth, covered = predicted_depth(model, images)
     both = (covered & torch.as_tensor(mask)).float()

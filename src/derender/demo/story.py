@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from pydantic import Field
 
-from derender import __version__, evaluation
+from derender import evaluation
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_images
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, faces
@@ -48,35 +48,54 @@ class Opening:
     source: str
 
 
+Report = Callable[[str, int, int, str], None]
+"""Called with (stage, done, total, note)."""
+
+STAGES = ("generating faces", "learning perceptual features", "training", "estimating features", "scoring")
+
+
 class LivePage:
-    """The page of a running demo: the opening, progress, the newest samples; browsers reload it."""
+    """The page of a running demo in a new folder: the opening, progress, the newest samples; it reloads."""
 
-    def __init__(self, file: Path, opening: Opening):
-        self.file, self.opening = file, opening
+    def __init__(self, out: Path, images: str | Path | None, side: int, report: Report):
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise FileExistsError(f"{out} exists and is not empty: choose another --out")
+        report("editing photographs", 0, 1, "")
+        self.file, self.samples = out / "report.html", out / "run" / "samples"
+        self.opening = opening(images, side)
         self.updated = float("-inf")
+        self.update("Training begins")
 
-    def update(self, status: str, run: Path | None = None) -> None:
+    def update(self, status: str) -> None:
         """Write the page, at most every few seconds."""
         if time.monotonic() - self.updated < REFRESH_S:
             return
-        samples = sorted((run / "samples").glob("*.png")) if run is not None else []
+        samples = sorted(self.samples.glob("*.png"))
         sample = samples[-1].read_bytes() if samples else None
         values = {"opening": self.opening, "status": status, "sample": sample}
         lead = "Depth, lighting and viewpoint are predicted from one image each, without labels."
-        footer = f"derender {__version__}"
-        Page("demo_opening.html", "Images decomposed", lead, values, footer, REFRESH_S).write(self.file)
+        page = Page("demo_opening.html", "Images decomposed", lead, values, refresh_s=REFRESH_S)
+        page.write(self.file)
         self.updated = time.monotonic()
+
+    def follow(self, progress: Progress, report: Report) -> None:
+        """Report what training tells, at the terminal and on the page."""
+        stages = {"perceptual": STAGES[1], "train": STAGES[2], "features": STAGES[3]}
+        note, stage = "", stages.get(progress.phase, "reading images")
+        if progress.phase == "train":
+            note = f"{progress.images_per_second:.0f} images/s"
+            self.update(f"{progress.done:,} of {progress.total:,} images seen")
+        report(stage, progress.done, progress.total, note)
 
 
 def opening(address: str | Path | None = None, side: int = 512) -> Opening:
     """Photographs relit, rotated, in the light of another; generated ones if no face is found."""
-    shown, source = [], "generated portraits, which show no real person"
+    shown, source = [], "your photographs"
     if address is not None:
         read = read_images(address, side, limit=EXAMINED).images.transpose(0, 2, 3, 1)
         shown = [photo for photo in read if find_faces(photo)][:SHOWN]
-    if shown:
-        source = "your photographs"
-    shown = shown or portraits(side)
+    if not shown:
+        shown, source = portraits(side), "generated portraits, which show no real person"
     model = load(EDITOR)
     photos = [open_photograph(photo, model) for photo in shown]
     donors = [*photos[1:], photos[0]]
@@ -109,10 +128,6 @@ def portraits(side: int) -> list[Photo]:
     return made
 
 
-Report = Callable[[str, int, int, str], None]
-"""Called with (stage, done, total, note)."""
-
-STAGES = ("generating faces", "learning perceptual features", "training", "estimating features", "scoring")
 BUNDLED = "rendered-faces-64"
 """The bundled model that has seen rendered faces only, as this demo's has."""
 
@@ -181,11 +196,6 @@ class DemoResult:
     seconds: dict[str, float]  # time of each stage
 
     @property
-    def optimised(self) -> Derenderer:
-        """The trained model, with its scenes optimised per image."""
-        return optimised(self.model, self.settings.fit_steps)
-
-    @property
     def identities(self) -> np.ndarray:
         """(N,) the person on each unseen image."""
         return self.truth.labels["identity"]
@@ -208,7 +218,8 @@ def run_demo(
         ValueError: training collapsed before it saved a model.
     """
     out = Path(out)
-    live = _open(out, None, settings, report, opened)
+    live = LivePage(out, None, settings.portrait_px, report)
+    opened(live.file)
     seconds: dict[str, float] = {}
     began, now = time.perf_counter(), STAGES[0]
 
@@ -226,8 +237,9 @@ def run_demo(
     seen, _ = _generated(count, size, train_seed, lambda done, _: at(STAGES[0], done, count))
     unseen, truth = _generated(settings.test_pictures, size, test_seed)
     trained = train(
-        config, seen, out / "run", sample_sheet=decomposition_sheet, progress=_told(at, live, out / "run")
-    )
+        config, seen, out / "run", sample_sheet=decomposition_sheet,
+        progress=lambda progress: live.follow(progress, at),
+    )  # fmt: skip
     if not (out / "run" / "model").exists():
         reason = "; ".join(finding.text for finding in trained.findings) or trained.stopped
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
@@ -270,53 +282,22 @@ def run_own_demo(
 
     What needs true depth or names of people is left out. ``out`` and ``opened`` are as in `run_demo`.
     """
-    out = Path(out)
-    live = _open(out, images, settings, report, opened)
-    plain = tuple(
-        one
-        for one in settings.overrides
-        if one.startswith(("warmup", "objective", "image", "batch", "whitening", "fitting"))
-    )
+    run = Path(out) / "run"
+    live = LivePage(Path(out), images, settings.portrait_px, report)
+    opened(live.file)
+    own = ("warmup", "objective", "image", "batch", "whitening", "fitting")
+    plain = tuple(one for one in settings.overrides if one.startswith(own))
     config = settings.model_copy(update={"overrides": plain}).training(seed, split=(0.8, 0.1, 0.1))
 
-    train_on(images, out=out / "run", config=config, page=False, progress=_told(report, live, out / "run"))
+    train_on(
+        images, out=run, config=config, page=False, progress=lambda progress: live.follow(progress, report)
+    )
     report(STAGES[4], 0, 1, "")
-    page = run_page(out / "run", run_evidence(out / "run", images))
+    page = run_page(run, run_evidence(run, images))
     values = {**page.values, "opening": live.opening}
     return replace(page, template="demo_own.html", title="Your images decomposed", values=values).write(
         live.file
     )
-
-
-def _open(
-    out: Path,
-    images: str | Path | None,
-    settings: DemoSettings,
-    report: Report,
-    opened: Callable[[Path], object],
-) -> LivePage:
-    """The first page in a new folder."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not empty: choose another --out")
-    report("editing photographs", 0, 1, "")
-    live = LivePage(out / "report.html", opening(images, settings.portrait_px))
-    live.update("Training begins")
-    opened(live.file)
-    return live
-
-
-def _told(report: Callable[..., None], live: LivePage, run: Path) -> Callable[[Progress], None]:
-    """What training reports, for the terminal and for the page."""
-
-    def tell(progress: Progress) -> None:
-        stages = {"perceptual": STAGES[1], "train": STAGES[2], "features": STAGES[3]}
-        note, stage = "", stages.get(progress.phase, "reading images")
-        if progress.phase == "train":
-            note = f"{progress.images_per_second:.0f} images/s"
-            live.update(f"{progress.done:,} of {progress.total:,} images seen", run)
-        report(stage, progress.done, progress.total, note)
-
-    return tell
 
 
 def _generated(

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_erosion, generate_binary_structure
 from torch import Tensor
 
 from derender.data import GroundTruth
-from derender.evaluation.image_scores import Columns, ImageResult
+from derender.evaluation.image_scores import ImageResult
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 from derender.features.extract import check_size
@@ -47,9 +47,9 @@ class GeometryResult(ImageResult):
     """Errors of the predicted depth beside those of controls, all on the same images. Controls are the mean
     true depth map, constant depth, and fresh weights (None without an architecture)."""
 
-    columns: ClassVar[Columns] = {
-        "side": (Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0"), 100.0),
-        "mad_deg": (Column("MAD", "low", 1, "mean angle between normals in degrees, best 0"), 1.0),
+    columns: ClassVar[Mapping[str, Column]] = {
+        "side": Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0", scale=100),
+        "mad_deg": Column("MAD", "low", 1, "mean angle between normals in degrees, best 0"),
     }
     caption = "Geometry on {:,} images with exact depth"
     coverage = Column(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from derender.data import GroundTruth
 from derender.evaluation.depth import angle_deg
-from derender.evaluation.image_scores import Columns, ImageResult
+from derender.evaluation.image_scores import ImageResult
 from derender.evaluation.score_table import Column
 from derender.features import map_batches
 from derender.features.extract import check_size
@@ -50,12 +50,12 @@ class FactorResult(ImageResult):
     Values per image are (N,). ``untrained`` has fresh weights.
     """
 
-    columns: ClassVar[Columns] = {
-        "albedo": (Column("albedo", "low", 4, _ALBEDO), 1.0),
-        "albedo_global": (Column("one scale", "low", 4, "the same after one scale for all images"), 1.0),
-        "light": (Column("light", "low", 1, _LIGHT), 1.0),
-        "aligned": (Column("aligned", "low", 1, "the same after the best rotation of all directions"), 1.0),
-        "camera": (Column("camera", "low", 1, _CAMERA), 1.0),
+    columns: ClassVar[Mapping[str, Column]] = {
+        "albedo": Column("albedo", "low", 4, _ALBEDO),
+        "albedo_global": Column("one scale", "low", 4, "the same after one scale for all images"),
+        "light": Column("light", "low", 1, _LIGHT),
+        "aligned": Column("aligned", "low", 1, "the same after the best rotation of all directions"),
+        "camera": Column("camera", "low", 1, _CAMERA),
     }
     caption = "Albedo, light and camera on {:,} images"
     notes: ClassVar[Mapping[str, str]] = {

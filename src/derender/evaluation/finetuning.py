@@ -281,7 +281,7 @@ def score_finetuned(
     """Held-out scores of ``fine-tuned``, of heads on frozen features and of controls, 0..1, best 1.
 
     Beside it stand both heads on the frozen features of ``began``, logistic regression on three controls, and
-    ``majority``; ``versus`` compares it with the best of these. ``n_unlabelled`` images have none of the
+    ``majority``. ``versus`` compares it with the best of these. ``n_unlabelled`` images have none of the
     labels. ``result`` are the ``ScoredRow``; what took long is kept in ``memory``.
 
     Raises:

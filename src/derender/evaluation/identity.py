@@ -91,11 +91,9 @@ def identify(
         found = compare_clusterings(
             {name: [run[near] for run in runs] for name, runs in ready.features.items()}, {label: who[near]},
             controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
-        )  # fmt: skip
-        ward = {row.name: row.scores for row in found.rows}
-        more = [{f"ward {score}": ward[row.name][score] for score in ("accuracy", "nmi")} for row in scored]
-        wider = zip(scored, more, strict=True)
-        scored = with_verdicts([replace(row, scores={**row.scores, **own}) for row, own in wider])
+        ).rows  # fmt: skip
+        ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in found}
+        scored = with_verdicts([replace(row, scores={**row.scores, **ward[row.name]}) for row in scored])
         note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
         columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
@@ -185,18 +183,17 @@ def read_pairs(path: str | Path) -> Pairs:
     body = [line for line in lines[1:] if line.strip()]
     if len(body) != 2 * folds * count:
         raise ValueError(f"{path}: expected {2 * folds * count} pairs as line 1 says, got {len(body)}")
-    first, second, same, fold = [], [], [], []
+    rows = []
     for number, line in enumerate(body):
         words, matched = line.split("\t") if "\t" in line else line.split(), number % (2 * count) < count
         words = [words[0], words[1], words[0], words[2]] if matched and len(words) == 3 else words
         if len(words) != 4 or not (words[1].isdecimal() and words[3].isdecimal()):
             form = "NAME 1 4" if matched else "NAME 1 OTHER 2"
             raise ValueError(f"{path}, line {number + 2}: expected {form}, got {line!r}")
-        first.append(f"{words[0]}_{int(words[1]):04d}")
-        second.append(f"{words[2]}_{int(words[3]):04d}")
-        same.append(matched)
-        fold.append(number // (2 * count) if folds > 1 else number % FOLDS)
-    return Pairs(tuple(first), tuple(second), np.array(same), np.array(fold))
+        names = (f"{name}_{int(place):04d}" for name, place in (words[:2], words[2:]))
+        rows.append((*names, matched, number // (2 * count) if folds > 1 else number % FOLDS))
+    first, second, same, fold = zip(*rows, strict=True)
+    return Pairs(first, second, np.array(same), np.array(fold))
 
 
 def verify(
@@ -240,22 +237,22 @@ def verify(
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
-    weights = group_resamples(np.arange(len(pairs)), how.resamples, how.seed)
+    drawn = group_resamples(np.arange(len(pairs)), how.resamples, how.seed)
+    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every pair once
     scored, errors = [], {}
     for row in rows:
         runs = [_judged(run, sides, pairs) for run in row.arrays()]
         right = np.mean([own for own, _ in runs], axis=0)
-        areas = [area_under_roc(cosine, pairs.same) for _, cosine in runs]
-        drawn = np.mean([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs], axis=0)
-        scores = {
-            "accuracy": estimate([float(right.mean())], weights @ right / weights.sum(axis=1)),
-            "auc": estimate(np.concatenate(areas), drawn),
-        }
+        accuracy = weights @ right / weights.sum(axis=1)
+        areas = np.stack([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs])
+        scores = {"accuracy": estimate(accuracy[:1], accuracy[1:])}
+        scores["auc"] = estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
         each = [float(right[pairs.fold == fold].mean()) for fold in np.unique(pairs.fold)]
         errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
         scored.append(ScoredRow(row.name, row.control, len(runs), scores))
-    half_right = {name: constant(0.5, how.resamples) for name in ("accuracy", "auc")}
-    scored = with_verdicts([*scored, ScoredRow("chance", True, 1, half_right)])
+    half_right = constant(0.5, how.resamples)
+    scored.append(ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
+    scored = with_verdicts(scored)
     columns = {
         "accuracy": Column("accuracy", "high", note="share of pairs judged right, mean over folds"),
         "auc": Column("AUC", "high", note="area under the ROC curve over all pairs"),

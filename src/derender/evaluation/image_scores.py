@@ -6,6 +6,7 @@ covered) is left out of its row's means; a single image has no interval.
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from math import isfinite
 from typing import Any, ClassVar, Literal
@@ -20,13 +21,10 @@ from derender.evaluation.bootstrap import (
     group_resamples,
     with_verdicts,
 )
-from derender.evaluation.score_table import Cell, Column, Row, ScoreTable, interval_column, interval_of
+from derender.evaluation.score_table import Column, ScoreTable, scored_table
 
 LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
 """Edges of Extended Yale B's subsets: the angle between light and view."""
-
-Columns = Mapping[str, tuple[Column, float]]
-"""By score, its column and the factor from the score to the unit of the column."""
 
 
 class ImageResult:
@@ -36,7 +34,7 @@ class ImageResult:
     column of ``coverage`` where rows have that. ``notes`` are on rows, by their name.
     """
 
-    columns: ClassVar[Columns]
+    columns: ClassVar[Mapping[str, Column]]
     caption: ClassVar[str]
     coverage: ClassVar[Column | None] = None
     notes: ClassVar[Mapping[str, str]] = {}
@@ -58,25 +56,18 @@ class ImageResult:
 
     def table(self, rows: Sequence[ScoredRow] | None = None) -> ScoreTable:
         """The scores in the units of the columns; with ``rows``, their intervals too."""
-        heads: list[Column] = []
-        for column, _ in self.columns.values():
-            heads += [column] if rows is None else [column, interval_column(column, "images")]
-        heads += [] if self.coverage is None else [self.coverage]
-        made = []
-        for row in rows or self.rows(1):
-            cells: list[Cell] = []
-            for score, (_, scale) in self.columns.items():
-                cells.append(scale * row.scores[score].value)
-                cells += [] if rows is None else [interval_of(row, score, scale)]
-            cells += [] if self.coverage is None else [self.named()[row.name].coverage]
-            made.append(Row(row.name, cells, row.control, self.notes.get(row.name, "")))
         count = len(next(iter(self.each()["model"].values())))
-        return ScoreTable(self.caption.format(count), "prediction", heads, made)
+        more = {} if self.coverage is None else {self.coverage: lambda row: self.named()[row.name].coverage}
+        found = scored_table(
+            self.caption.format(count), "prediction", rows or self.rows(1), self.columns,
+            intervals=() if rows is None else tuple(self.columns), deviations=(), more=more, over="images",
+        )  # fmt: skip
+        return replace(found, rows=[replace(row, note=self.notes.get(row.name, "")) for row in found.rows])
 
 
 def image_rows(
     scores: Mapping[str, Mapping[str, np.ndarray]],
-    columns: Columns,
+    columns: Mapping[str, Column],
     *,
     controls: Collection[str] | None = None,
     groups: np.ndarray | None = None,
@@ -94,7 +85,7 @@ def image_rows(
     for name, each in scores.items():
         found = {score: _estimate(values, weights) for score, values in each.items()}
         rows.append(ScoredRow(name, name in quiet, 1, found))
-    return with_verdicts(rows, lower=[name for name, (column, _) in columns.items() if column.best == "low"])
+    return with_verdicts(rows, lower=[name for name, column in columns.items() if column.best == "low"])
 
 
 def binned_rows(
@@ -124,21 +115,20 @@ def binned_rows(
         row: {name: np.where(rows, own, np.nan) for name, rows in inside.items()}
         for row, own in scores.items()
     }
-    rows = image_rows(each, {name: (column, 1.0) for name, column in columns.items()}, **how)
-    return rows, columns, counts
+    return image_rows(each, columns, **how), columns, counts
 
 
-def image_verdicts(row: ScoredRow, columns: Columns) -> list[str]:
+def image_verdicts(row: ScoredRow, columns: Mapping[str, Column]) -> list[str]:
     """In words, for every score: the row against the strongest control."""
     found = []
-    for score, (column, scale) in columns.items():
+    for score, column in columns.items():
         one = row.versus.get(score)
         if one is None or not isfinite(one.low):
             continue
         how = "better than" if one.above else "worse than" if one.high < 0 else "not distinguished from"
-        ends = [f"{scale * value:+.{column.digits}f}" for value in (one.value, one.low, one.high)]
+        ends = [f"{column.scale * value:+.{column.digits}f}" for value in (one.value, one.low, one.high)]
         found.append(
-            f"{column.name}: {column.text(scale * row.scores[score].value)}, {how} the strongest "
+            f"{column.name}: {column.text(column.scale * row.scores[score].value)}, {how} the strongest "
             f"control ({one.rival}), by {ends[0]}, 95 % {ends[1]} to {ends[2]}"
         )
     return found

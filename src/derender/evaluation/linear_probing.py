@@ -10,7 +10,7 @@ balanced accuracy is 0.5 for any constant answer (one over the number of classes
 threshold, and is the label's share for answers that know nothing.
 
 Table 2's "Finetune" trains the encoders, too. They and the head share Adam 2e-4, 100 epochs and batches of
-64; the paper does not say whether the encoders had a rate of their own. Of a baseline the whole network is
+64. The paper names no rate of the encoders' own. Of a baseline the whole network is
 trained; a ResNet-18 with fresh weights is the paper's supervised row. An untrained model under the same
 protocol is the control. Controls without an encoder have nothing below the head to train: theirs are the
 answers of the head alone. Leaves out the rendering objective beside the task (finetuning.py).
@@ -293,7 +293,7 @@ def finetune(
     def embed(numbers: np.ndarray) -> torch.Tensor:
         pictures = as_float(np.ascontiguousarray(images[numbers])).to(device)
         parts = (
-            [net.encode(pictures) for net in nets.values()]
+            [net.encoder(pictures) for net in nets.values()]
             if ours
             else nets["whole"].embed(pictures).values()
         )

@@ -14,6 +14,7 @@ person's two. Leaves out cast shadows.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from derender.evaluation.score_table import Column, Scores, scored_table
 from derender.features import map_batches, missing
 from derender.inputs import Progress, as_images, as_model
 from derender.model import Derenderer
-from derender.photo import PhotoDetail
+from derender.photo import PhotoDetail, editable_scenes
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
@@ -87,9 +88,7 @@ def brightness(
     table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
     seen["constant answer"] = {"albedo": np.tile(mean.mean(axis=0), (len(mean), 1)), "light": nothing}
     apart = {name: {"chroma": _apart(one["albedo"], mean)} for name, one in seen.items()}
-    rows = image_rows(
-        apart, {"chroma": (_CHROMA, 1.0)}, groups=people, resample_count=how.resamples, seed=how.seed
-    )
+    rows = image_rows(apart, {"chroma": _CHROMA}, groups=people, resample_count=how.resamples, seed=how.seed)
     light = {name: agreement(one["light"], mean @ LUMA, weights)["r"] for name, one in seen.items()}
     rows = [replace(row, scores={**row.scores, "light": light[row.name]}) for row in rows]
     columns = {"chroma": _CHROMA, "light": _LIGHT}
@@ -189,21 +188,22 @@ def relight(
         model: a model, or the name or folder of one.
         images: the address of images with identity and light, such as the cropped Extended Yale B.
         size: side in pixels of the images that are relit, at least the model's.
-        fit_steps: steps of per-image optimisation of the model's scenes.
+        fit_steps: steps of per-image optimisation of the scenes; by default those of edits.
         options: seed, resamples, dataset, limit, device, progress: fields of ``Options``.
 
     Raises:
         ValueError: the images lack identity or light, or no two people share two lights.
     """
     how = Options(images=images, **{"keep_duplicates": True, **options})
-    model = optimised(as_model(model, device=how.device), fit_steps)
+    model = as_model(model, device=how.device)
     read = how.at(model.image_size)
     if lacking := [name for name in NEEDED if name not in read.labels]:
         raise ValueError(f"{read.source} has no label {lacking[0]!r}: give images of known light, as Yale B")
     large = read if isinstance(images, ImageSet) else as_images(
         images, size, dataset=how.dataset, limit=how.limit, keep_duplicates=True
     )  # fmt: skip
-    batches = map_batches(model.decompose, model, read.images, batch_size=64, progress=how.stage("model"))
+    scenes_of = partial(editable_scenes, model, steps=fit_steps)
+    batches = map_batches(scenes_of, model, read.images, batch_size=64, progress=how.stage("model"))
     scenes = Scene.joined(batches)
     who, off = read.labels["identity"].astype(str), read.labels["light_deg"]
     lit = list(zip(read.labels[NEEDED[1]].tolist(), read.labels[NEEDED[2]].tolist(), strict=True))
@@ -253,7 +253,7 @@ def relight(
         caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {len(people)} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
         values[title.lower()] = numbers_of(scored)
-        notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": (columns["all"], 1.0)})]
+        notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": columns["all"]})]
     return Scores(tables, values, notes)
 
 

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.evaluation.image_scores import Columns, ImageResult
+from derender.evaluation.image_scores import ImageResult
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 
@@ -54,10 +54,10 @@ class ReconstructionResult(ImageResult):
     own.
     """
 
-    columns: ClassVar[Columns] = {
-        "l1": (Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"), 1.0),
-        "psnr_db": (Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"), 1.0),
-        "ssim": (Column("SSIM", "high", note="structural similarity inside the mask, at most 1"), 1.0),
+    columns: ClassVar[Mapping[str, Column]] = {
+        "l1": Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"),
+        "psnr_db": Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"),
+        "ssim": Column("SSIM", "high", note="structural similarity inside the mask, at most 1"),
     }
     caption = "Reconstruction of {:,} images"
     coverage = Column("coverage", None, note="share of all pixels inside the mask")

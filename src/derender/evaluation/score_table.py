@@ -30,13 +30,15 @@ LATEX_ARROWS = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
 @dataclass(frozen=True)
 class Column:
     """One column of numbers: its head, the better end (None where they are no score), digits after the point.
-    A note has range, unit and meaning; ``of`` is the score whose interval or deviation the column holds."""
+    A note has range, unit and meaning; ``of`` is the score whose interval or deviation the column holds. Its
+    numbers are those of a score times ``scale``."""
 
     name: str
     best: Literal["high", "low"] | None = None
     digits: int = 3
     note: str = ""
     of: str = ""
+    scale: float = 1.0
 
     @property
     def head(self) -> str:
@@ -221,23 +223,25 @@ def scored_table(
     intervals: Sequence[str] | None = None,
     deviations: Sequence[str] | None = None,
     more: Mapping[Column, Callable[[ScoredRow], Cell]] | None = None,
+    over: str = "scored rows",
 ) -> ScoreTable:
     """One row for each scored row, one column for each score in ``columns``.
 
     Scores in ``intervals`` are followed by their 95 % interval, those in ``deviations`` by their standard
     deviation over seeds; by default the first. ``more`` gives further columns, each with a function of
-    the row.
+    the row. Resamples are ``over`` these.
     """
     main = list(columns)[:1]
     shown: dict[Column, Callable[[ScoredRow], Cell]] = {}
     for name, column in columns.items():
-        shown[column] = lambda row, name=name: row.scores[name].value
+        shown[column] = lambda row, name=name, by=column.scale: by * row.scores[name].value
         if name in (main if intervals is None else intervals):
-            shown[interval_column(column)] = lambda row, name=name: interval_of(row, name)
+            between = interval_column(column, over)
+            shown[between] = lambda row, name=name, by=column.scale: interval_of(row, name, by)
         if name in (main if deviations is None else deviations):
             note = f"standard deviation of {column.name} over seeds"
             spread = Column("±", None, column.digits, note, column.name)
-            shown[spread] = lambda row, name=name: row.scores[name].deviation
+            shown[spread] = lambda row, name=name, by=column.scale: by * row.scores[name].deviation
     shown |= more or {}
     cells = [Row(row.name, [cell(row) for cell in shown.values()], row.control) for row in rows]
     return ScoreTable(caption, first, tuple(shown), cells)

@@ -234,8 +234,10 @@ def similarity(
     method: str, factor: str, changed: str, own: Tensor, others: Sequence[Tensor], size: int
 ) -> Similarity:
     """Mean similarity of maps (n, y, x) with each of several others of the same images."""
+    everywhere = torch.ones(len(own), size, size, device=own.device)
+    shown, *drawn = (upsampled(to_one(maps), size)[:, None].expand(-1, 3, -1, -1) for maps in (own, *others))
     ranks = np.concatenate([spearman(own, other) for other in others])
-    ssim = np.concatenate([_ssim(own, other, size) for other in others])
+    ssim = np.concatenate([masked_ssim(shown, other, everywhere).cpu().numpy() for other in drawn])
     known = np.isfinite(ranks)
     mean = alike = spread = float("nan")
     if known.any():
@@ -249,9 +251,3 @@ def spearman(first: Tensor, second: Tensor) -> np.ndarray:
     a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
     length = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
     return np.divide((a * b).sum(axis=1), length, out=np.full(len(a), np.nan), where=length > 0)
-
-
-def _ssim(first: Tensor, second: Tensor, size: int) -> np.ndarray:
-    one, other = (upsampled(to_one(m), size)[:, None].expand(-1, 3, -1, -1) for m in (first, second))
-    everywhere = torch.ones(len(first), size, size, device=first.device)
-    return masked_ssim(one, other, everywhere).cpu().numpy()

@@ -130,16 +130,15 @@ def explain(
     if not names:
         names, _ = chosen_labels(table, None, True, least=0)
     task = question(table.labels, names, bins=bins, min_count=min_count, source=images.source)
-    split = split_rows(task, table, count, range(seed, seed + seeds), groups)
-    untrained = [
-        untrained_features(
-            net, images, seed=one, batch_size=batch_size, progress=progress(f"untrained encoder {one}")
-        ).factors
-        for one in range(seed, seed + seeds)
-    ]
+    own = range(seed, seed + seeds)
+    split = split_rows(task, table, count, own, groups)
+    untrained = []
+    for one in own:
+        how = {"batch_size": batch_size, "progress": progress(f"untrained encoder {one}")}
+        untrained.append(untrained_features(net, images, seed=one, **how).factors)
     shares = explain_labels(
-        table.factors, task, split, untrained=untrained, seeds=range(seed, seed + seeds), head=head,
-        output=output, baseline=baseline, progress=progress("probing"),
+        table.factors, task, split, untrained=untrained, seeds=own, head=head, output=output,
+        baseline=baseline, progress=progress("probing"),
     )  # fmt: skip
     apart = alike = None
     if clusters is not None:

@@ -15,12 +15,7 @@ from safetensors.numpy import save
 from scipy.special import expit, softmax
 
 from derender.data import suggestion
-from derender.evaluation.linear_probes import (
-    PAPER_HEAD,
-    HeadSettings,
-    fitted_heads,
-    logistic_weights,
-)
+from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, fitted_heads, logistic_weights
 from derender.evaluation.linear_task import Task, task_of
 from derender.features import missing
 from derender.settings import Settings

@@ -11,34 +11,26 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import pad
 
 from derender.networks.decoders import MapDecoder, VectorDecoder
-from derender.networks.encoders import Code, Encoder, Images, NetworkSettings, UNetEncoder, activations
+from derender.networks.encoders import Encoder, Images, NetworkSettings, UNetEncoder, activations
 from derender.scene.camera import focal_px, shared_tensor
 from derender.scene.perturb import PerturbSettings, exchange, perturb_camera, perturb_light
 from derender.scene.ranges import SceneRanges
 
 
 class FactorNet(nn.Module):
-    """Encoder and decoder of one factor; images are in 0..1."""
+    """Encoder and decoder of one factor, image (0..1) to code and code to the value before its range."""
 
     def __init__(self, encoder: Encoder | UNetEncoder, decoder: nn.Module):
         super().__init__()
         self.encoder, self.decoder, self.code_size = encoder, decoder, encoder.code_size
-
-    def encode(self, images: Images) -> Code:
-        """The factor's feature, one row per image."""
-        return self.encoder(images)
 
     def activations(self, images: Images) -> Float[Tensor, "n _"]:
         """The code, followed by the encoder's last spatial map."""
         spatial = self.encoder.spatial(images)
         return activations(self.encoder.to_code(spatial).flatten(1), spatial)
 
-    def decode(self, code: Code) -> Tensor:
-        """The factor's raw value, before its range is applied."""
-        return self.decoder(code)
-
     def forward(self, images: Images) -> Tensor:
-        return self.decode(self.encode(images))
+        return self.decoder(self.encoder(images))
 
 
 @dataclass(frozen=True)

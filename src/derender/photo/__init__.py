@@ -10,13 +10,21 @@ faces         faces found, and the frame that a face model knows
 
 from derender.photo.align import Aligned, align
 from derender.photo.detail import PhotoDetail
-from derender.photo.edit import Photograph, editable_scenes, found_frame, open_photograph, relight, rotate
+from derender.photo.edit import (
+    Photograph,
+    editable_scenes,
+    editing_steps,
+    found_frame,
+    open_photograph,
+    relight,
+    rotate,
+)
 from derender.photo.faces import Face, face_candidates, find_faces
 from derender.photo.frame import Frame
 from derender.photo.video import EditedVideo, edit_video, is_video
 
 __all__ = [
     "Aligned", "EditedVideo", "Face", "Frame", "PhotoDetail", "Photograph", "align", "edit_video",
-    "editable_scenes", "face_candidates", "find_faces", "found_frame", "is_video", "open_photograph",
-    "relight", "rotate",
+    "editable_scenes", "editing_steps", "face_candidates", "find_faces", "found_frame", "is_video",
+    "open_photograph", "relight", "rotate",
 ]  # fmt: skip

@@ -139,10 +139,14 @@ def open_photograph(
 
 
 def editable_scenes(model: Derenderer, images: Float[Tensor, "n 3 h w"], steps: int | None = None) -> Scene:
-    """Scenes of images, optimised in ``steps``: None are ``FIT_STEPS`` if the model can, 0 none."""
-    if steps is None:
-        steps = FIT_STEPS if model.fitting is not None else 0
+    """Scenes of images before they are edited, optimised in ``editing_steps``."""
+    steps = editing_steps(model, steps)
     return model.fit_scenes(images, steps).scene if steps else model.decompose(images)
+
+
+def editing_steps(model: Derenderer, steps: int | None) -> int:
+    """Steps as given; None are ``FIT_STEPS`` if the model can be optimised per image, else 0."""
+    return steps if steps is not None else FIT_STEPS if model.fitting is not None else 0
 
 
 def relight(

@@ -166,7 +166,7 @@ class EmbeddingModel(nn.Module):
             with torch.no_grad():
                 codes = [self.encode(part) for part in portion.split(few)]
                 scene = Scene.joined([self.decode(one) for one in codes])
-                raws = [torch.cat([nets[row.name].decode(one[row.name]) for one in codes]) for row in rows]
+                raws = [torch.cat([nets[row.name].decoder(one[row.name]) for one in codes]) for row in rows]
             further = list(zip([row.parameter for row in rows], raws, ranged, strict=True))
             return fitting.fit(portion, scene, self.render, steps, further)
 

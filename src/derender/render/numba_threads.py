@@ -7,6 +7,7 @@ Compiled kernels are cached beside the package, or in the user's cache folder wh
 (``NUMBA_CACHE_DIR`` overrides). Where no folder can be written, they are compiled in every process.
 """
 
+import inspect
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +24,7 @@ PORTIONS_PER_THREAD = 4
 
 def kernel(function: Callable[..., Any], **own: Any) -> Callable[..., Any]:
     """Compile on first use, without the interpreter lock, keeping the machine code on disk where possible."""
+    function = inspect.unwrap(function)  # type checks may wrap it
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", **own}
     try:
         return numba.njit(cache=True, **options)(function)

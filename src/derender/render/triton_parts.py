@@ -6,14 +6,20 @@ integers, whose sums have no order. The integers' unit is set per image by the l
 in it, which a first run of the same kernel finds (``note_largest``).
 """
 
-from typing import no_type_check
+import inspect
+from collections.abc import Callable
+from typing import Any
 
 import triton
 import triton.language as tl
 
 
-@triton.jit
-@no_type_check
+def kernel(function: Callable[..., Any]) -> Any:
+    """As `triton.jit`, of the function itself where type checks wrap it."""
+    return triton.jit(inspect.unwrap(function))
+
+
+@kernel
 def lanes(per_image, BLOCK: tl.constexpr):
     """This program's image (int64, for addresses), its lanes within the image, and which of them exist."""
     program = tl.program_id(0)
@@ -23,29 +29,25 @@ def lanes(per_image, BLOCK: tl.constexpr):
     return image, lane, lane < per_image
 
 
-@triton.jit
-@no_type_check
+@kernel
 def float64(bits):
     """The scalar that ``float64_bits`` packed."""
     return bits.to(tl.float64, bitcast=True)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def magnitude(value, live):
     """|value| as an integer that orders like it (NaN above all), 0 where the lane is not live."""
     return tl.where(live, tl.abs(value.to(tl.float64)), 0.0).to(tl.int64, bitcast=True)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def note_largest(target, value):
     """Raise ``target`` to the block's largest magnitude."""
     tl.atomic_max(target, tl.max(value, 0), sem="relaxed")
 
 
-@triton.jit
-@no_type_check
+@kernel
 def accumulate(target, value, live, unit, MODE: tl.constexpr):
     """Add ``value`` at ``target``: as it is, or in units (a scalar per image) as the nearest integer."""
     if MODE == 2:

@@ -5,7 +5,6 @@ alone. A ray ends where nothing further on could be deeper, given the nearest su
 """
 
 from functools import partial
-from typing import no_type_check
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ def lowest_step(
 
 
 @partial(kernel, fastmath={"contract"})
-@no_type_check
 def _search(depth, towards, focal, step, first, last):
     height, width = depth.shape[1:]
     zero, one, twelve = depth.dtype.type(0), depth.dtype.type(1), depth.dtype.type(12)
@@ -62,7 +60,6 @@ def _search(depth, towards, focal, step, first, last):
 
 
 @kernel
-@no_type_check
 def _nearest_ahead(own, source_u, source_v, ahead):
     """Write for each pixel the smallest depth of all that lie further from the source in rows and columns.
 

@@ -5,8 +5,8 @@ panel         labelled grids of images
 decomposition  a decomposition as images
 sweeps        one scene in many lights, from many sides, with parts of another; as PNG, GIF and MP4
 mesh          a scene's surface for other programs
-opening, edits, editing  images opened, edited and written to disk
-charts        curves and bars as SVG
+options, opening, edits, editing  images opened, edited and written to disk
+charts        curves and bars as SVG; matrices
 page          one self-contained HTML file, made of templates/
 run, evidence, doctor, explanation, comparison, protocols  the pages
 viewer/       the page one can play with, and its server

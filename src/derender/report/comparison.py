@@ -66,7 +66,6 @@ def chart_of(table: ScoreTable) -> Chart | None:
     return None
 
 
-LONGEST_REASON = 60  # characters of it in a cell; the page and the Markdown say it whole
 SUMMARY_HEAD = "logistic"  # the head of the linear protocol that the one table shows
 COST_COLUMNS = {
     "numbers": Column("numbers", None, note="that describe an image"),
@@ -179,7 +178,7 @@ def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
     found = {row.name: row for row in table.rows}
     blank = [None] * (len(table.columns) - 1 - len(COST_COLUMNS))
     for name in one.absent.keys() - found.keys():
-        why = shorten(one.absent[name], LONGEST_REASON, placeholder=" ...")
+        why = shorten(one.absent[name], 60, placeholder=" ...")  # the page and the Markdown say it whole
         found[name] = Row(name, (why, *blank, *_cost_cells(one.costs.get(name, {}))))
     order = dict.fromkeys((*methods, *one.rows))
     verdict = verdict_table(rows, one.columns, f"{one.name}, above the strongest control? {one.about}")

@@ -25,8 +25,9 @@ from derender.render import Rendering
 from derender.renderers import Renderer
 from derender.report import colours
 from derender.report.opening import OpenedImage
-from derender.report.panel import GridLayout, labelled_grid, strip
+from derender.report.panel import labelled_grid, strip
 from derender.scene import Scene
+from derender.scene.enlarge import at_size
 from derender.scene.normals import normals_from_depth
 
 OTHER_AMBIENT_SHARE, OTHER_LIGHT_YAW_RAD, OTHER_LIGHT_PITCH_RAD = 0.3, radians(40), radians(10)
@@ -55,16 +56,9 @@ class Decomposition:
     # rows of further factors whose parameter is a few named numbers, by parameter
     numbers: Mapping[str, Factor] = field(default_factory=dict)
 
-    def __len__(self) -> int:
-        return len(self.scene)
-
-    def panel(self, index: int = 0, layout: GridLayout | None = None) -> Image.Image:
-        """The labelled panel of one image."""
-        return labelled_grid({name: [images[index]] for name, images in self.columns.items()}, layout=layout)
-
-    def sheet(self, row_labels: list[str] | None = None, layout: GridLayout | None = None) -> Image.Image:
+    def sheet(self) -> Image.Image:
         """One labelled panel with a row for every image."""
-        return labelled_grid(self.columns, row_labels, layout=layout)
+        return labelled_grid(self.columns)
 
     @property
     def row(self) -> dict[str, Image.Image]:
@@ -80,7 +74,7 @@ class Decomposition:
             for values in scene.parameters[row.parameter].tolist()
         }
         written = {**record, **scene_numbers(scene), **named}
-        self.panel().save(folder / "panel.png")
+        labelled_grid({name: [image] for name, image in self.row.items()}).save(folder / "panel.png")
         for name, image in self.row.items():
             strip([image]).save(folder / f"{name.replace(' ', '_')}.png")
         text = json.dumps(written, indent=1, ensure_ascii=False)
@@ -144,8 +138,12 @@ def decompose_images(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> Dec
 
 def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
     """An opened image (``opening``) with its factors drawn; images opened together share the depth scale."""
+    scene, detail = image.scene, image.detail
+    if detail is not None:
+        albedo = detail.on_grid(detail.albedo(), detail.size)
+        scene = at_size(scene, detail.size).with_parameters(albedo=albedo)
     pixels = as_float(image.pixels[None])
-    return decomposition(pixels, image.textured, model.render, model.fov_deg, image.depth_range, model)
+    return decomposition(pixels, scene, model.render, model.fov_deg, image.depth_range, model)
 
 
 def scene_numbers(scene: Scene) -> dict[str, Any]:

@@ -15,8 +15,6 @@ from derender.report.colours import enlarged, pictures
 from derender.report.page import Page
 from derender.report.panel import strip
 
-GAP_PX = 4
-
 
 def doctor_page(examination: Examination) -> Page:
     """The whole page for one set of images."""
@@ -38,7 +36,7 @@ def doctor_values(examination: Examination) -> dict[str, Any]:
         "least": CHECKS["agreement"].struggles,
         "mean": [enlarged(image, 128) for image in mirrored],
         "strips": {
-            title: strip(pictures(images.images[list(rows)]), GAP_PX)
+            title: strip(pictures(images.images[list(rows)]), gap=4)
             for title, rows in examination.examples.items()
         },
         "measures": measure_table(examination),

@@ -64,24 +64,19 @@ class WrittenImages:
     unlike: str = ""  # how images differ from those the model was validated on (``held_out_errors.unlike``)
     before: int = 0  # number of images that were left out, for their folders were there
 
-    @property
-    def out_of_distribution(self) -> dict[str, float]:
-        """Percentiles of images that are reconstructed worse than nearly all the model was validated on."""
-        return {path: at for path, at in self.percentiles.items() if at > OUTLIER_PERCENTILE}
-
     def notes(self) -> list[str]:
         """Lines for a person: what was left out, what is out-of-distribution, what was cropped."""
-        refused = list(self.refused.items())
-        lines = [f"left out {path}: {reason}" for path, reason in refused[:NAMED]]
-        if more := len(refused) - NAMED:
-            lines += [f"and {more:,} more (--json names all)"] if more > 0 else []
+        lines = [f"left out {path}: {reason}" for path, reason in self.refused.items()]
+        if (more := len(lines) - NAMED) > 0:
+            lines[NAMED:] = [f"and {more:,} more (--json names all)"]
         if self.before:
             lines.append(f"{self.before:,} images were done before")
         if self.percentiles:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
         if self.unlike:
-            lines.append(f"{self.unlike}; {next(iter(self.out_of_distribution))} is one")
+            first = next(path for path, at in self.percentiles.items() if at > OUTLIER_PERCENTILE)
+            lines.append(f"{self.unlike}; {first} is one")
         found = Counter(part["found"] for part in self.framing.values())
         faces = found["face"] + found["profile"]
         if faces or found["no face"]:
@@ -111,7 +106,7 @@ class WrittenImages:
 def write_images(
     opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
     force: bool = False, sheet: bool | None = None, beside: Sequence[OpenedImage] = (),
-    resume: bool = False, video: VideoEdit | None = None, progress: Callable[..., object] | None = None,
+    resume: bool = False, video: VideoEdit | None = None, progress: Callable[..., object],
 ) -> WrittenImages:  # fmt: skip
     """Edit images, and write a folder for each.
 
@@ -133,8 +128,6 @@ def write_images(
         ValueError: no image can be read, or the edit is impossible.
     """
     files = image_files(paths)
-    if not files:
-        raise ValueError("give at least one image")
     places, kept = _places(files, out), out / ROWS
     done = {file for file in files if resume and places[file].exists()}
     files = [file for file in files if file not in done]
@@ -160,8 +153,7 @@ def write_images(
                 np.savez(stream, allow_pickle=False, **cells)
         with atomic_folder(folder) as temporary:
             records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
-        if progress is not None:
-            progress(len(records), len(images), description="drawing")
+        progress(len(records), len(images), description="drawing")
     for path in moving:
         assert video is not None
         with atomic_folder(places[path]) as temporary:

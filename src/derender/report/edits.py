@@ -6,6 +6,7 @@ with transparency, film.gif and film.mp4. moved.json has the numbers of every st
 """
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import ceil, degrees, log10
@@ -22,7 +23,8 @@ from derender.photo import Photograph
 from derender.photo.video import Edit as VideoEdit
 from derender.report import sweeps
 from derender.report.colours import Images, pictures
-from derender.report.opening import FilmOptions, OpenedImage
+from derender.report.opening import OpenedImage
+from derender.report.options import EDIT_SIZE, FilmOptions
 from derender.report.panel import GridLayout, labelled_grid
 from derender.report.sweeps import FILMS
 from derender.scene import Scene
@@ -49,16 +51,11 @@ class Edit:
         """All images by label, in the order of the strip."""
         return {**self.inputs, **self.stills}
 
-    def strip(self) -> Image.Image:
-        """All images in one labelled row, as large as the stills are, and large enough to see."""
-        cell = min(LARGEST_CELL, max(SMALLEST_CELL, *(still.width for still in self.stills.values())))
-        return labelled_grid(
-            {name: [image] for name, image in self.row.items()}, layout=GridLayout(cell=cell)
-        )
-
     def write(self, folder: Path, record: Mapping[str, Any]) -> dict[str, Any]:
         """Write all files; returns the content of moved.json: the record, and each still's numbers."""
-        self.strip().save(folder / "strip.png", compress_level=3)
+        cell = min(LARGEST_CELL, max(SMALLEST_CELL, *(still.width for still in self.stills.values())))
+        strip = labelled_grid({name: [one] for name, one in self.row.items()}, layout=GridLayout(cell))
+        strip.save(folder / "strip.png", compress_level=3)
         stills = []
         for number, (label, still) in enumerate(self.stills.items(), 1):
             name = f"still-{number:02d}.png"
@@ -94,8 +91,7 @@ def relit(
         if like is not None:
             own, other = (one.scene.lighting[parameter] for one in (image, like))
             return torch.lerp(own, other, t.to(own)[:, None])
-        own = float(image.scene.light[0, :2].sum())
-        return sweeps.lights_around(t, reach_deg, pitch_deg, strength * own)
+        return _lights(image.scene, t, reach_deg, pitch_deg, strength)
 
     def label(place: float, row: Tensor) -> str:
         return f"light {angle(degrees(row[3]))}" if like is None else f"{place:.0%} of its light"
@@ -147,8 +143,7 @@ def relit_video(
     def edit(scene: Scene) -> dict[str, Tensor]:
         if like is not None:
             return {name: light.expand(len(scene), -1) for name, light in like.scene.lighting.items()}
-        own = float(scene.light[:, :2].sum(dim=1).mean())
-        return {"light": sweeps.lights_around(_over_time(scene, hold), reach_deg, pitch_deg, strength * own)}
+        return {"light": _lights(scene, _over_time(scene, hold), reach_deg, pitch_deg, strength)}
 
     return edit
 
@@ -169,6 +164,12 @@ def swapped_video(parameters: Sequence[str], donor: OpenedImage) -> VideoEdit:
         raise ValueError("the albedo of a video cannot be swapped: choose factors, such as --factor light")
     own = donor.scene.parameters
     return lambda scene: {name: own[name].expand(len(scene), *own[name].shape[1:]) for name in parameters}
+
+
+def _lights(scene: Scene, t: Tensor, reach_deg: float, pitch_deg: float, strength: float) -> Tensor:
+    """Lights around the object, ``strength`` times as strong as the mean of the scenes' own."""
+    own = float(scene.light[:, :2].sum(dim=1).mean())
+    return sweeps.lights_around(t, reach_deg, pitch_deg, strength * own)
 
 
 def _over_time(scene: Scene, hold: bool) -> Tensor:
@@ -209,13 +210,10 @@ def _swept(
     )
 
 
-def _inputs(
-    model: Derenderer, image: OpenedImage, other: OpenedImage | None = None
-) -> dict[str, Image.Image]:
-    shown = {
-        "input": pictures(image.shown[None])[0],
-        "reconstruction": sweeps.drawn(at_size(image.scene, image.side), model.render)[0],
-    }
+def _inputs(model: Derenderer, image: OpenedImage, other: OpenedImage | None) -> dict[str, Image.Image]:
+    height, width = image.shown.shape[-2:]
+    scene = at_size(image.scene, width if width == height else EDIT_SIZE)
+    shown = {"input": pictures(image.shown[None])[0], "reconstruction": sweeps.drawn(scene, model.render)[0]}
     return shown if other is None else {**shown, "the other": pictures(other.shown[None])[0]}
 
 
@@ -224,9 +222,4 @@ def _angle_text(reach_deg: float, stills: int) -> Callable[[float], str]:
     if reach_deg <= 0:
         raise ValueError(f"reach must be above 0 degrees, got {reach_deg:g}")
     decimals = max(0, ceil(-log10(2 * reach_deg / (stills - 1))))
-
-    def written(angle_deg: float) -> str:
-        number = f"{angle_deg:+.{decimals}f}"
-        return f"{number if float(number) else number[1:]}°"
-
-    return written
+    return lambda angle_deg: re.sub(r"^[+-](?=[0.]*°)", "", f"{angle_deg:+.{decimals}f}°")  # 0 has no sign

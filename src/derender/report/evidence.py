@@ -25,10 +25,10 @@ from derender.features import embed_image_set
 from derender.inputs import as_images, as_model
 from derender.interpretation import explain_labels, question
 from derender.model import Derenderer
+from derender.report.charts import card_matrices, matrix_sheet
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
 from derender.report.doctor import doctor_values
 from derender.report.explanation import share_chart, share_values
-from derender.report.matrices import card_matrices, matrix_sheet
 from derender.report.sweeps import animated_png, relit_and_rotated
 from derender.storage.bounded import read_json
 

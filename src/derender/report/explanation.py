@@ -6,7 +6,7 @@ shows where, the percentage how much.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,6 @@ from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 from derender.storage.atomic import atomic_folder
 
 STRENGTH = 0.75
-SHOWN_PX = 64
-BLURRED_PX = 5  # of 64: single pixels say little
 LAYOUT = GridLayout(cell=128, gap=6, label=13, title=18)
 Pixels = Float[Tensor, "n 3 h w"]
 
@@ -44,7 +42,7 @@ def overlays(images: Pixels, maps: Float[Tensor, "n y x"]) -> Images:
     """
     size = images.shape[-1]
     if maps.shape[-1] == size:
-        side = max(1, round(BLURRED_PX * size / SHOWN_PX)) // 2 * 2 + 1
+        side = max(1, round(size / 12.8)) // 2 * 2 + 1  # single pixels say little
         how = {"stride": 1, "padding": side // 2, "count_include_pad": False}
         heat = attributed.to_one(torch.nn.functional.avg_pool2d(maps[:, None], side, **how)[:, 0])
     else:
@@ -104,19 +102,14 @@ def draw_maps(
             checks = attributed.sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
             fresh, title = untrained_twin(model, 0), f"{name}: grad-cam with fresh weights"
             made["fresh weights"] = saliency_sheet(fresh, probe, batch, target, "grad-cam", title)
-            made["feature"] = feature_sheet(model, batch, shares.factors)
+            columns = {"input": pictures(batch)}
+            for factor in shares.factors:
+                seen = attributed.saliency("grad-cam", model, batch, factor)  # without a question
+                columns[factor] = overlays(batch, seen)
+            made["feature"] = labelled_grid(columns, title="the feature itself", layout=LAYOUT)
         if progress is not None:
             progress(place + 1, len(best))
     return sheets, checks
-
-
-def feature_sheet(model: Any, images: Pixels, factors: Sequence[str]) -> Image.Image:
-    """Where each factor's feature comes from, without a question."""
-    columns = {"input": pictures(images)}
-    columns |= {
-        name: overlays(images, attributed.saliency("grad-cam", model, images, name)) for name in factors
-    }
-    return labelled_grid(columns, title="the feature itself", layout=LAYOUT)
 
 
 def safe_name(name: str) -> str:

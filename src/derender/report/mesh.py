@@ -26,7 +26,8 @@ from torch import Tensor
 
 from derender.model import Derenderer
 from derender.report.colours import pictures
-from derender.report.opening import MESH_FORMATS, MESH_SIZE, OpenedImage
+from derender.report.opening import OpenedImage
+from derender.report.options import MESH_FORMATS, MESH_SIZE
 from derender.scene import Scene
 from derender.scene.camera import unproject
 from derender.scene.enlarge import at_size
@@ -79,11 +80,8 @@ class Mesh:
         text, beside = export_obj(
             shape(matt), include_normals=True, return_texture=True, mtl_name=f"{name}.mtl"
         )
-        return {
-            f"{name}.obj": text.encode(),
-            f"{name}.mtl": beside[f"{name}.mtl"],
-            f"{name}.png": beside[f"{name}.png"],
-        }
+        more = {file: beside[file] for file in (f"{name}.mtl", f"{name}.png")}
+        return {f"{name}.obj": text.encode(), **more}
 
 
 @dataclass(frozen=True)
@@ -172,8 +170,11 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
             f"nothing of this surface is seen at less than {grazing_deg:g} degrees: allow more, or see "
             "whether the model was trained"
         )
-    corners = _faces(surface, width)
-    used, faces = np.unique(corners, return_inverse=True)
+    row, column = np.nonzero(surface)
+    a = row * width + column
+    b, c, d = a + width, a + 1, a + width + 1
+    corners = np.concatenate((np.stack((a, b, c), axis=1), np.stack((c, b, d), axis=1)))
+    used, faces = np.unique(corners, return_inverse=True)  # two triangles a cell, counter-clockwise
     to_gltf = np.array([1.0, -1.0, -1.0])
     vertices = (points.numpy().reshape(-1, 3) - (0, 0, 1)) * to_gltf
     outward = -normals_from_depth(depth, fov_deg)[0].numpy().reshape(-1, 3) * to_gltf
@@ -208,11 +209,3 @@ def _largest_piece(cells: np.ndarray) -> np.ndarray:
     if pieces.max() > 1:
         cells = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
     return np.asarray(ndimage.binary_fill_holes(cells))
-
-
-def _faces(cells: np.ndarray, width: int) -> np.ndarray:
-    """(F, 3) numbers of grid points, two triangles for each cell, counter-clockwise with y up."""
-    row, column = np.nonzero(cells)
-    a = row * width + column
-    b, c, d = a + width, a + 1, a + width + 1
-    return np.concatenate((np.stack((a, b, c), axis=1), np.stack((c, b, d), axis=1)))

@@ -16,8 +16,6 @@ FAINT = (120, 124, 132)
 PAPER = (255, 255, 255)
 ROWS_PER_SHEET = 16
 
-Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
-
 
 @dataclass(frozen=True)
 class GridLayout:
@@ -137,7 +135,7 @@ def strip(images: Images, gap: int = 0) -> Image.Image:
     return row
 
 
-def shortened(text: str, font: Font, width: int) -> str:
+def shortened(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:
     """The text on one line, an ellipsis in its middle where it is wider than ``width`` pixels."""
     text = " ".join(text.split())
     if font.getlength(text) <= width:

@@ -30,14 +30,10 @@ SHEETS_SHOWN, SHEET_PX, SHEET_PIXEL_LIMIT = 4, 1080, 20_000_000
 Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
 Metrics = Sequence[Mapping[str, Any]]
 CHARTS = {
-    "l1": ("L1", "Mean absolute difference between image and reconstruction, inside the mask."),
+    "l1": ("L1", "Mean absolute difference between image and reconstruction, inside the mask if any."),
     "loss": ("loss", "Minimised loss, on held-out images. With a confidence net it can fall below zero: the "
              "logarithm of sigma is part of it."),
 }  # fmt: skip
-BASELINE_CHARTS = {
-    "l1": ("L1", "Mean absolute difference between image and reconstruction."),
-    "loss": ("loss", "Validation loss on held-out images."),
-}
 
 
 def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
@@ -71,7 +67,7 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
             for sign, text in row.items()
             if row.get("kind") == "collapse" and sign not in ("kind", "images", "seconds")
         ],
-        "charts": loss_charts(metrics, CHARTS if isinstance(config, TrainConfig) else BASELINE_CHARTS),
+        "charts": loss_charts(metrics),
         "samples": samples,
         "evidence": evidence,
         "failures": [*_failures(run, config, metrics), *unread],
@@ -85,15 +81,13 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
     return Page("run.html", f"Training run {run.path.name}", lead, values, version)
 
 
-def loss_charts(
-    metrics: Metrics, charted: Mapping[str, tuple[str, str]] = CHARTS
-) -> list[tuple[str, str, str]]:
+def loss_charts(metrics: Metrics) -> list[tuple[str, str, str]]:
     """The total loss and the reconstruction error over images seen, training beside held-out.
 
     Each is SVG text, its alternative text and its caption.
     """
     made = []
-    for key, (label, text) in charted.items():
+    for key, (label, text) in CHARTS.items():
         series = {}
         for kind, name in (("train", "training"), ("validation", "held out")):
             if rows := [row for row in metrics if row.get("kind") == kind and _finite(row.get(key))]:

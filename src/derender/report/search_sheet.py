@@ -1,6 +1,6 @@
 """Contact sheet of a search: the query, then the nearest images with their distances."""
 
-from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,20 @@ def search_sheet(
     captions = {found.table.files[row]: "query" for row in [found.own_row] if row is not None}
     for row, distance in zip(found.rows, found.distances, strict=True):
         captions.setdefault(found.table.files[row], f"{distance:.3f}")
-    read = _read(list(captions), address, dataset, progress)
+    missing, read = set(captions), {}
+    with open_images(address, dataset=dataset) as stream, quiet_pillow():
+        for sample in stream.samples():
+            if sample.file in missing:
+                missing.remove(sample.file)
+                with suppress(Unreadable, ValueError, OSError):
+                    read[sample.file] = decode(sample.read(), CELL, box=sample.box)
+                if progress is not None:
+                    progress(len(read), len(captions))
+            if not missing:
+                break
+    if not read:
+        some = list(captions)[-1]
+        raise ValueError(f"{address} holds none of the images found, such as {some!r}: give another address")
     shown = [] if found.own_row is not None else [("query", read_image(Path(found.like), CELL))]
     shown += [(caption, read[file]) for file, caption in captions.items() if file in read]
     names, drawn = [caption for caption, _ in shown], pictures(np.stack([image for _, image in shown]))
@@ -45,27 +58,3 @@ def search_sheet(
     sheet = contact_sheet(drawn, names, across=7, title=title, layout=layout)
     write_whole(out, png_bytes(sheet))
     return [file for file in captions if file not in read]
-
-
-def _read(
-    files: Sequence[str], address: str, dataset: str, progress: Progress | None
-) -> dict[str, np.ndarray]:
-    """Images by name, as far as they can be read; nothing else is decoded."""
-    missing, read = set(files), {}
-    with open_images(address, dataset=dataset) as stream, quiet_pillow():
-        for sample in stream.samples():
-            if sample.file in missing:
-                missing.remove(sample.file)
-                try:
-                    read[sample.file] = decode(sample.read(), CELL, box=sample.box)
-                except (Unreadable, ValueError, OSError):
-                    continue
-                if progress is not None:
-                    progress(len(read), len(files))
-            if not missing:
-                break
-    if not read:
-        raise ValueError(
-            f"{address} holds none of the images found, such as {files[-1]!r}: give another address"
-        )
-    return read

@@ -6,7 +6,7 @@ however it is rotated. Films become bytes: animated PNG (all colours, transparen
 frame), MP4 (H.264).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from io import BytesIO
 from math import inf, pi, radians
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from derender.features import named
@@ -73,9 +73,7 @@ def varied(scene: Scene, **parameters: Tensor) -> Scene:
     """One scene once for each row of the given parameters, with those in place of its own."""
     if len(scene) != 1:
         raise ValueError(f"a sweep shows one scene, got {len(scene)}: pass scene[index]")
-    count, *others = {len(value) for value in parameters.values()}
-    if others:
-        raise ValueError(f"the parameters of a sweep need one number of rows, got {sorted([count, *others])}")
+    count = len(next(iter(parameters.values())))
     repeated = scene.detach().map(lambda value: value.expand(count, *value.shape[1:]))
     return repeated.with_parameters(**{name: value.to(scene.depth) for name, value in parameters.items()})
 
@@ -146,10 +144,10 @@ def _around(t: Tensor, reach_deg: float, pitch_deg: float) -> tuple[Tensor, Tens
     return torch.full_like(t, radians(pitch_deg)), radians(reach_deg) * (2 * t - 1)
 
 
-def animated_png(frames: Images, seconds: float = 2.4) -> bytes:
+def animated_png(frames: Images) -> bytes:
     """An endless loop as the bytes of an animated PNG."""
     # disposal=1: each frame starts from an empty canvas, since frames have transparent parts
-    return _animated(frames, "PNG", round(1000 * seconds / max(1, len(frames))), disposal=1)
+    return _animated(frames, "PNG", round(2400 / max(1, len(frames))), disposal=1)
 
 
 def gif(frames: Images, seconds: float = 2.4) -> bytes:
@@ -157,16 +155,11 @@ def gif(frames: Images, seconds: float = 2.4) -> bytes:
 
     A GIF counts in hundredths of a second, at least two for each frame.
     """
-    flat = {
-        id(frame): on_background(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG).copy()
-        for frame in {id(frame): frame for frame in frames}.values()
-    }
-    return _animated(
-        [flat[id(frame)] for frame in frames],
-        "GIF",
-        10 * max(2, round(100 * seconds / max(1, len(frames)))),
-        optimize=False,
-    )
+    flat = {id(frame): frame for frame in frames}  # on the way back frames come again
+    for key, frame in flat.items():
+        flat[key] = on_background(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG).copy()
+    frame_ms = 10 * max(2, round(100 * seconds / max(1, len(frames))))
+    return _animated([flat[id(frame)] for frame in frames], "GIF", frame_ms, optimize=False)
 
 
 def _animated(frames: Images, form: str, frame_ms: int, **settings: Any) -> bytes:
@@ -184,18 +177,13 @@ def mp4(frames: Images, seconds: float = 2.4) -> bytes:
     """
     _enough(frames)
     width, height = frames[0].size
+    odd = (0, 0, width % 2, height % 2)
+    on_white = (np.asarray(ImageOps.expand(on_background(frame), odd, "white")) for frame in frames)
     even = (width + width % 2, height + height % 2)
-
-    def on_white() -> Iterator[np.ndarray]:
-        for frame in frames:
-            canvas = Image.new("RGB", even, (255, 255, 255))
-            canvas.paste(on_background(frame), (0, 0))
-            yield np.asarray(canvas)
-
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         try:
-            write_video(path, on_white(), even, len(frames) / seconds)
+            write_video(path, on_white, even, len(frames) / seconds)
         except ValueError as error:
             raise ValueError(f"{str(error).replace(str(path), 'MP4 here')}: write a GIF instead") from error
         return path.read_bytes()

@@ -112,8 +112,8 @@ def naming_damage(folder: Path) -> Iterator[None]:
         ) from error
 
 
-class ErrorsFile(Settings):
-    """Errors of held-out images: the values (0..1) that 0, 1, ... 100 % of them do not exceed."""
+class HeldOutErrors(Settings):
+    """Errors of held-out images: the masked L1 (0..1) that 0, 1, ... 100 % of them do not exceed."""
 
     format: Literal[1] = 1
     measure: str = "mean absolute difference inside the mask, 0..1"

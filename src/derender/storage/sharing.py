@@ -19,7 +19,7 @@ from derender.storage import folder as files
 from derender.storage import hub
 from derender.storage.atomic import new_folder
 from derender.storage.bounded import parse_json, read_bounded
-from derender.storage.folder import ErrorsFile, texts_beside
+from derender.storage.folder import HeldOutErrors, texts_beside
 from derender.storage.places import CARD_FILE, ERRORS_FILE, SPLIT_FILE, model_folder, require_known
 from derender.storage.tensors import UNIT, packed, read_described, write_tensors
 
@@ -112,7 +112,7 @@ def with_metadata(card: str, licence: str | None = None) -> str:
 def _errors_in_words(errors: str) -> str:
     """Median and 99th percentile of held-out errors (JSON); empty where there are none."""
     try:
-        stored = parse_json(errors, ErrorsFile)
+        stored = parse_json(errors, HeldOutErrors)
     except ValueError:
         return ""
     median, high = stored.quantiles[50], stored.quantiles[99]

@@ -158,16 +158,15 @@ def _fit_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]
     for key, value in moments.items():
         index, _, name = key.partition(".")
         found.setdefault(int(index), {})[name] = value
+    optimiser.state.clear()
     for index, entries in found.items():
         if not 0 <= index < len(parameters) or entries.keys() != {"step", *_MOMENTS}:
             raise ValueError(f"the optimiser's state {index} holds {', '.join(sorted(entries))}")
+        own = parameters[index]
         for name, value in entries.items():
-            wanted = torch.Size() if name == "step" else parameters[index].shape
+            wanted = torch.Size() if name == "step" else own.shape
             if value.shape != wanted:
                 raise ValueError(f"{index}.{name} has shape {tuple(value.shape)}, expected {tuple(wanted)}")
-    optimiser.state.clear()
-    for index, entries in found.items():
-        own = parameters[index]
         step = entries["step"].to(own.device, torch.float32)
         likened = {name: torch.empty_like(own).copy_(entries[name]) for name in _MOMENTS}
         optimiser.state[own] = {"step": step, **likened}

@@ -137,7 +137,7 @@ def fit_whitening(
             for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
                 shown = _renderings(model, scene, batch, rest, perturb, others, settings.views)
-                codes = [model.nets[factor.name].encode(one).float() for one in shown]  # type: ignore[operator]
+                codes = [model.nets[factor.name].encoder(one).float() for one in shown]  # type: ignore[operator]
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     if describe is None:
         size = size or model.settings.network.code_size

@@ -6,7 +6,6 @@ one proves nothing: a plain surface may be easy to render whatever it shows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from derender.data import as_float
 from derender.model import load
 from derender.storage.atomic import write_whole
 from derender.storage.bounded import read_json
-from derender.storage.folder import QUANTILES, ErrorsFile
+from derender.storage.folder import QUANTILES, HeldOutErrors
 from derender.storage.places import ERRORS_FILE, bundled_models, model_folder
 from derender.training.process import evaluating
 
@@ -38,14 +37,6 @@ Images = UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"]
 
 class NotFinite(ValueError):
     """A model renders NaN or infinity."""
-
-
-@dataclass(frozen=True)
-class HeldOutErrors:
-    """The errors of ``pictures`` images: the masked L1 (0..1) that 0, 1, ... 100 % of them do not exceed."""
-
-    quantiles: Float[np.ndarray, " 101"]
-    pictures: int
 
 
 def reconstruction_errors(model: Any, images: Images, batch_size: int = 64) -> Float[np.ndarray, " n"]:
@@ -128,7 +119,8 @@ def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors
     errors = errors[np.isfinite(errors)]
     if not len(errors):
         raise ValueError("the model renders nothing into any of the images: see whether it was trained")
-    return HeldOutErrors(np.quantile(errors, np.linspace(0, 1, QUANTILES)), len(errors))
+    quantiles = np.quantile(errors, np.linspace(0, 1, QUANTILES)).tolist()
+    return HeldOutErrors(pictures=len(errors), quantiles=[float(f"{value:.6g}") for value in quantiles])
 
 
 def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErrors | None:
@@ -145,9 +137,7 @@ def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErr
 
 def write_errors(folder: Path, errors: HeldOutErrors) -> Path:
     """Write the file into a saved model's folder, atomically."""
-    quantiles = [float(f"{value:.6g}") for value in errors.quantiles.tolist()]
-    stored = ErrorsFile(pictures=errors.pictures, quantiles=quantiles)
-    return write_whole(folder / ERRORS_FILE, stored.model_dump_json() + "\n")
+    return write_whole(folder / ERRORS_FILE, errors.model_dump_json() + "\n")
 
 
 def read_errors(folder: Path) -> HeldOutErrors | None:
@@ -155,5 +145,4 @@ def read_errors(folder: Path) -> HeldOutErrors | None:
     file = folder / ERRORS_FILE
     if not file.is_file():
         return None
-    stored = read_json(file, ErrorsFile, "make it again with derender evaluate reconstruction --store")
-    return HeldOutErrors(np.array(stored.quantiles, np.float64), stored.pictures)
+    return read_json(file, HeldOutErrors, "make it again with derender evaluate reconstruction --store")

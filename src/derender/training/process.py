@@ -13,7 +13,7 @@ import stat
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -146,15 +146,15 @@ def _acquired(file: Path) -> int:
             handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
         except FileNotFoundError:  # its last owner has just removed the folder
             continue
-        try:
+        with ExitStack() as undone:
+            undone.callback(os.close, handle)
             if not stat.S_ISREG(os.fstat(handle).st_mode):
                 raise ValueError(f"{file} is no regular file: delete it")
+            lives, owner = False, None
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                lives = False
             except OSError:
                 lives = True
-            owner = None
             with suppress(ValueError):  # not written yet
                 owner = parse_json(os.pread(handle, _OWNER_BYTES, 0), _Owner)
             if lives or (owner is not None and owner.host != own.host):
@@ -165,8 +165,5 @@ def _acquired(file: Path) -> int:
                 if os.path.samestat(os.fstat(handle), file.lstat()):  # not removed by its last owner
                     os.ftruncate(handle, 0)
                     os.pwrite(handle, own.model_dump_json().encode(), 0)
+                    undone.pop_all()
                     return handle
-        except BaseException:
-            os.close(handle)
-            raise
-        os.close(handle)

@@ -15,8 +15,8 @@ pytest.importorskip("starlette", reason="the viewer's packages are not installed
 pytest.importorskip("uvicorn", reason="the viewer's packages are not installed: derender[view]")
 
 from derender import Derenderer
-from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.neighbours import Example
+from derender.report.viewer.app import Application
+from derender.report.viewer.images import Example
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
@@ -109,6 +109,6 @@ def picture() -> np.ndarray:
 @pytest.fixture(scope="session")
 def client(model, picture):
     """A viewer with one example and room for four images."""
-    viewer = Viewer(Studio(model, "<b>tiny</b>", Shelf(4)), [Example("<img src=x>", picture)])
-    with serving(Application(viewer)) as url:
+    studio = Studio(model, "<b>tiny</b>", Shelf(4), [Example("<img src=x>", picture)])
+    with serving(Application(studio)) as url:
         yield Client(url)

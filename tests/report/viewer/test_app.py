@@ -15,8 +15,8 @@ from PIL import Image
 
 from derender import Derenderer, load
 from derender.data.synthetic import faces
-from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.neighbours import rendered_examples
+from derender.report.viewer.app import Application
+from derender.report.viewer.images import rendered_examples
 from derender.report.viewer.questions import CropRequest, Light, Place, Refused, ViewRequest
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.studio import Shelf, Studio
@@ -176,7 +176,7 @@ def test_several_visitors_at_once_get_their_own_answers(client):
 @pytest.mark.parametrize("sent", [b"", b"POST /api/pictures HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
 def test_who_sends_no_head_is_not_waited_for(model, monkeypatch, sent):
     monkeypatch.setattr(BoundedProtocol, "head_seconds", 0.3)
-    with serving(Application(Viewer(Studio(model, "tiny", Shelf(2))))) as url:
+    with serving(Application(Studio(model, "tiny", Shelf(2)))) as url:
         place = ("127.0.0.1", int(url.rsplit(":", 1)[1].strip("/")))
         with socket.create_connection(place, timeout=5) as connection:
             connection.sendall(sent)
@@ -184,8 +184,8 @@ def test_who_sends_no_head_is_not_waited_for(model, monkeypatch, sent):
 
 
 def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):
-    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), work_seconds=0.2)
-    asked = {"picture": application.viewer.studio.open(picture)["picture"]}
+    application = Application(Studio(model, "tiny", Shelf(2)), work_seconds=0.2)
+    asked = {"picture": application.studio.open(picture)["picture"]}
     application._computing.submit(time.sleep, 1.0)
     with serving(application) as url:
         reply = type(client)(url).post("/api/view", asked)

@@ -16,8 +16,8 @@ from derender import load
 from derender.data.synthetic import faces
 from derender.features import FeatureTable, embed_images
 from derender.model import Derenderer
-from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.neighbours import Example, Gallery
+from derender.report.viewer.app import Application
+from derender.report.viewer.images import Example, Gallery
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
@@ -38,8 +38,8 @@ def address(rendered) -> Iterator[str]:
     made = {"fit_steps": model.fitting.settings.steps}
     table = FeatureTable(("a<b>.png", "b.png", "c.png"), embed_images(model, rendered), {}, made)
     examples = [Example(f"<i>face</i> {at}", one.transpose(1, 2, 0)) for at, one in enumerate(rendered)]
-    viewer = Viewer(Studio(model, "rendered-faces-64", Shelf(3), table=table), examples, Gallery(table))
-    with serving(Application(viewer)) as url:
+    studio = Studio(model, "rendered-faces-64", Shelf(3), examples, Gallery(table))
+    with serving(Application(studio)) as url:
         yield url
 
 
@@ -198,7 +198,7 @@ def test_effects_of_a_renderer_have_sliders(browser, rendered):
     model = Derenderer.seeded(settings, 0)
     model.load_state_dict(model.state_dict() | plain.state_dict())
     examples = [Example("face", rendered[0].transpose(1, 2, 0))]
-    with serving(Application(Viewer(Studio(model.eval(), "glossy", Shelf(3)), examples))) as url:
+    with serving(Application(Studio(model.eval(), "glossy", Shelf(3), examples))) as url:
         shown = begun(browser)
         shown.goto(url)
         shown.wait_for_selector("body[data-ready]")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from derender import load
-from derender.report.viewer.neighbours import named_examples, rendered_examples
+from derender.report.viewer.images import rendered_examples
 from derender.storage.places import bundled_models, model_folder
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, read_errors, reconstruction_percentile
 
@@ -24,6 +24,3 @@ def test_rendered_examples_are_known_to_the_model_and_differ(model):
 def test_every_bundled_model_has_examples_and_others_have_none(tmp_path):
     assert all(rendered_examples(name) for name in bundled_models())
     assert rendered_examples(str(tmp_path / "faces")) == []
-    mine = np.zeros((8, 8, 3), np.uint8)
-    (only,) = named_examples({tmp_path / "me.png": mine})
-    assert only.name == "me.png" and only.picture is mine

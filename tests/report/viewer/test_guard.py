@@ -3,7 +3,7 @@
 import pytest
 from starlette.datastructures import Headers
 
-from derender.report.viewer.guard import Guard, allowed_host, is_loopback
+from derender.report.viewer.server import Guard, allowed_host, is_loopback
 
 HERE = ("127.0.0.1:8000", "localhost", "LOCALHOST:80", "[::1]:8000")
 ELSEWHERE = ("evil.example", "127.0.0.1.evil.example:8000", "evil.example:127", "192.168.1.7:8000")

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from derender.photo import Frame
-from derender.report.viewer.guard import Body, Uploads
+from derender.report.viewer.images import Shelf, ShownImage
 from derender.report.viewer.questions import Refused
-from derender.report.viewer.shelf import Shelf, ShownImage
+from derender.report.viewer.server import Body, Uploads
 from derender.scene import Scene
 
 

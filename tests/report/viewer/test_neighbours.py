@@ -7,8 +7,8 @@ from tests.cli.conftest import noise
 from derender.data import read_images
 from derender.features import FeatureTable, embed_image_set
 from derender.features.neighbours import nearest
-from derender.report.viewer.app import Application, Viewer
-from derender.report.viewer.neighbours import Gallery
+from derender.report.viewer.app import Application
+from derender.report.viewer.images import Gallery
 from derender.report.viewer.questions import Refused
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
@@ -27,8 +27,7 @@ def table(model, folder) -> FeatureTable:
 
 
 def test_neighbours_of_a_picture_of_the_table(model, folder, table, client):
-    viewer = Viewer(Studio(model, "tiny", Shelf(2), table=table), gallery=Gallery(table))
-    with serving(Application(viewer)) as url:
+    with serving(Application(Studio(model, "tiny", Shelf(2), gallery=Gallery(table)))) as url:
         visitor = type(client)(url)
         assert visitor.get("/api/about").json["table"] == {
             "rows": 6, "factors": ["geometry", "albedo", "light", "camera"], "note": "",

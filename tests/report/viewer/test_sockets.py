@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 
 from derender.report.viewer import app
-from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, Application, Viewer
+from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, Application
 from derender.report.viewer.questions import BODY_LIMIT_BYTES
 from derender.report.viewer.server import BoundedProtocol, serving
 from derender.report.viewer.studio import Shelf, Studio
@@ -76,7 +76,7 @@ def test_an_address_that_reads_no_body_is_not_sent_one_for_ever(client):
 
 @pytest.mark.parametrize(("length", "sent", "status"), [(1_000_000, 3, {408}), (1 << 60, 1000, {408, 413})])
 def test_less_than_the_length_says_ends_in_time(model, length, sent, status):
-    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=0.3)
+    application = Application(Studio(model, "tiny", Shelf(2)), body_seconds=0.3)
     with serving(application) as url, connected(url) as connection:
         connection.sendall(head(url, more=f"Content-Length: {length}\r\n") + bytes(sent))
         assert int(answered(connection).split(b" ")[1]) in status
@@ -84,7 +84,7 @@ def test_less_than_the_length_says_ends_in_time(model, length, sent, status):
 
 @pytest.mark.parametrize("sent", [3, 900_000])
 def test_uploads_that_stall_hold_up_no_other(model, sent):
-    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=60)
+    application = Application(Studio(model, "tiny", Shelf(2)), body_seconds=60)
     with serving(application) as url, ExitStack() as stalled:
         for _ in range(8):
             connection = stalled.enter_context(connected(url))
@@ -98,7 +98,7 @@ def test_uploads_that_stall_hold_up_no_other(model, sent):
 
 def test_those_that_stall_make_room_for_the_others(model, monkeypatch):
     monkeypatch.setattr(app, "UPLOADS_LIMIT_BYTES", 1_000_000)
-    application = Application(Viewer(Studio(model, "tiny", Shelf(2))), body_seconds=60)
+    application = Application(Studio(model, "tiny", Shelf(2)), body_seconds=60)
     with serving(application) as url, ExitStack() as stalled:
         begun = []
         for number in range(1, 9):  # each has to be slower than the one that comes last
@@ -117,7 +117,7 @@ def test_those_that_stall_make_room_for_the_others(model, monkeypatch):
 
 
 def test_large_uploads_at_once_are_all_answered(model):
-    application = Application(Viewer(Studio(model, "tiny", Shelf(2))))
+    application = Application(Studio(model, "tiny", Shelf(2)))
     with serving(application) as url, ExitStack() as stalled:
         begun = [stalled.enter_context(connected(url)) for _ in range(12)]
         for connection in begun:
@@ -181,7 +181,7 @@ def test_broken_chunks_are_refused(client):
 
 def test_answers_nobody_takes_end_the_connection(model, monkeypatch, client):
     monkeypatch.setattr(BoundedProtocol, "taking_seconds", 0.3)
-    with serving(Application(Viewer(Studio(model, "tiny", Shelf(2))))) as url:
+    with serving(Application(Studio(model, "tiny", Shelf(2)))) as url:
         request = f"GET /view.js HTTP/1.1\r\nHost: 127.0.0.1:{place(url)[1]}\r\n\r\n".encode()
         with socket.socket() as connection:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -6,13 +6,12 @@ A protocol is a function of its name, which takes a place in ``EXAMPLES``.
 import typer
 
 from derender.cli.evaluate.disentangle import disentangle
-from derender.cli.evaluate.features import cluster, linear
-from derender.cli.evaluate.identity import identify, verify
+from derender.cli.evaluate.features import cluster, identify, linear, verify
 from derender.cli.evaluate.photographs import brightness, light, pose, relight
 from derender.cli.evaluate.robustness import robustness
 from derender.cli.evaluate.scenes import geometry, reconstruction
 from derender.cli.evaluate.segment import segment
-from derender.cli.gathered import command
+from derender.cli.options import command
 
 EXAMPLES = {
     cluster: "lfw.zip --model faces-64 --label identity",

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Literal
 
 from derender.cli import options, scoring
-from derender.cli.console import progress_bar, result
+from derender.cli.console import result
+from derender.cli.options import option
 
 
 @dataclass(frozen=True)
@@ -17,34 +16,30 @@ class CardImages(options.PartOfImages):
     limit: options.Limit = 2000
 
 
-PNG = "PNG file for all matrices."
-Out = Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE.png", help=PNG)]
-Seeds = Annotated[int, scoring.number(max=20, help="Number of seeds.")]
-Swapped = Annotated[int, scoring.number(min=2, help="Most images in the swap test.")]
 DIMENSIONS = "Scores by dimension: lasso, trees (takes minutes), or none."
-Dimensions = Annotated[Literal["lasso", "trees", "none"], typer.Option(help=DIMENSIONS)]
 
 
 def disentangle(
-    images: CardImages, trained: options.TrainedModel, published: scoring.Published, out: Out = None,
-    seeds: Seeds = 3, swap_pictures: Swapped = 256, dimensions: Dimensions = "lasso",
+    images: CardImages, trained: options.TrainedModel, published: scoring.Published,
+    out: Path | None = option(None, "PNG file for all matrices.", "--out", "-o", metavar="FILE.png"),
+    seeds: int = scoring.number(3, "Number of seeds.", max=20),
+    swap_pictures: int = scoring.number(256, "Most images in the swap test.", min=2),
+    dimensions: Literal["lasso", "trees", "none"] = option("lasso", DIMENSIONS),
     batch_size: options.BatchSize = 64, seed: options.Seed = 0, cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
-    published.check(out, [".png"])
-    from derender import evaluation
+    published.check_drawing(out, [".png"])
     from derender.evaluation.memory import memory_in
 
     model, memory = trained.open(), memory_in(cache)
     chosen = images.read(model.image_size, model=trained.model)
-    with progress_bar("scoring", "steps") as report:
-        scores = evaluation.disentangle(
-            model, chosen, seeds=range(seed, seed + seeds), swap_images=swap_pictures,
-            dimensions=None if dimensions == "none" else dimensions, batch_size=batch_size, memory=memory,
-            progress=report,
-        )  # fmt: skip
+    scores = scoring.measured(
+        "disentangle", model, chosen, seeds=range(seed, seed + seeds), swap_images=swap_pictures,
+        dimensions=None if dimensions == "none" else dimensions, batch_size=batch_size, memory=memory,
+        unit="steps",
+    )  # fmt: skip
     if out is not None:
-        from derender.report.matrices import write_card
+        from derender.report.charts import write_card
 
         write_card(scores.result, f"{trained.model}: {len(chosen):,} images", out)
         result(f"matrices in {out}", published.json_file)

@@ -1,27 +1,21 @@
-"""`derender evaluate cluster` and `linear`: features by a label that training never saw."""
-
-from typing import Annotated
-
-import typer
+"""`derender evaluate cluster`, `linear`, `identify` and `verify`: features by labels training never saw."""
 
 from derender.cli import options, scoring
+from derender.cli.options import option
 
 MEAN_BY = "Average first over rows that share this label; may be repeated."
-MeanBy = Annotated[list[str] | None, typer.Option("--mean-by", help=MEAN_BY)]
-Clusters = Annotated[int | None, scoring.number(help="Number of clusters; default: one for each class.")]
 HEADS = "Probes: linear (the paper's), centred (the same on features of mean 0), logistic, k-NN."
+BY = "Column of angles that groups the probes; default: light_deg, if there."
+GALLERY = "Images of the gallery; default: one a person, that of the smallest angle."
 FINETUNE = "Also train the encoders with the head (slow without a GPU)."
-Heads = Annotated[str, typer.Option(help=HEADS)]
-Seeds = Annotated[int, scoring.number(help="Number of random training subsets.")]
-Tested = Annotated[float, scoring.share(help="Share of the rows that is tested.")]
-Finetune = Annotated[bool, typer.Option("--finetune", help=FINETUNE)]
-Epochs = Annotated[int, scoring.number(help="Epochs of the paper's head.")]
 
 
 def cluster(
     images: options.DataOptions, subject: scoring.ScoredSubject, labels: scoring.Labels,
     computed: scoring.Computed, published: scoring.Published, method: scoring.Method = "ward",
-    mean_by: MeanBy = None, clusters: Clusters = None, untrained_seeds: scoring.UntrainedSeeds = 3,
+    mean_by: list[str] | None = option(None, MEAN_BY),
+    clusters: int | None = scoring.number(None, "Number of clusters; default: one for each class."),
+    untrained_seeds: scoring.UntrainedSeeds = 3,
 ) -> None:  # fmt: skip
     """Do features group images by a label that training never saw? 1 is best."""
     own = {"method": method, "clusters": clusters, "mean_by": mean_by or ()}
@@ -32,8 +26,11 @@ def cluster(
 def linear(
     images: options.DataOptions, subject: scoring.ScoredSubject, labels: scoring.Labels,
     computed: scoring.Computed, published: scoring.Published, counts: scoring.Counts = "100,500,1000",
-    heads: Heads = "linear,logistic,k-NN", seeds: Seeds = 5, test_fraction: Tested = 0.5,
-    groups: scoring.Groups = None, finetune: Finetune = False, epochs: Epochs = 100,
+    heads: str = option("linear,logistic,k-NN", HEADS),
+    seeds: int = scoring.number(5, "Number of random training subsets."),
+    test_fraction: float = scoring.share(0.5, "Share of the rows that is tested."),
+    groups: scoring.Groups = None, finetune: bool = option(False, FINETUNE, "--finetune"),
+    epochs: int = scoring.number(100, "Epochs of the paper's head."),
     untrained_seeds: scoring.UntrainedSeeds = 5,
 ) -> None:  # fmt: skip
     """How much does a linear head learn from features, given 100, 500 or 1,000 labels? 1 is best."""
@@ -41,3 +38,34 @@ def linear(
     own |= {"seeds": seeds, "test_fraction": test_fraction, "groups": groups}
     own |= {"finetune": finetune, "epochs": epochs, "untrained_seeds": untrained_seeds}
     scoring.score("linear", published, images, subject, **vars(labels), **vars(computed), **own)
+
+
+def identify(
+    images: options.DataOptions, subject: scoring.ScoredSubject, computed: scoring.Computed,
+    published: scoring.Published,
+    label: str = option("identity", "Label column of the people.", "--label", "-l"),
+    by: str | None = option(None, BY, metavar="COLUMN"),
+    bins: str = option("12,25,50,77", "Upper edges of the groups in degrees, with commas between."),
+    gallery: str | None = option(None, GALLERY, metavar="COLUMN=VALUE"),
+    centred: bool = option(True, "Subtract the mean of the gallery before the cosine."),
+    cluster_within: float = option(50.0, "Also cluster images up to this angle.", metavar="DEG"),
+    untrained_seeds: scoring.UntrainedSeeds = 3,
+) -> None:  # fmt: skip
+    """Is a person recognised by one image, in any light? Nearest of a gallery by cosine; 1 is best.
+
+    The cropped Extended Yale B needs no options: the gallery is its frontal light, the groups its subsets.
+    """
+    own = {"label": label, "by": by, "bins": scoring.numbers_of(bins, "--bins"), "gallery": gallery}
+    own |= {"centred": centred, "cluster_within": cluster_within, "untrained_seeds": untrained_seeds}
+    scoring.score("identify", published, images, subject, **vars(computed), **own)
+
+
+def verify(
+    images: options.DataOptions, subject: scoring.ScoredSubject, computed: scoring.Computed,
+    published: scoring.Published,
+    pairs: str = option(..., "Pairs in the format of LFW's pairs.txt.", metavar="FILE"),
+    untrained_seeds: scoring.UntrainedSeeds = 3,
+) -> None:  # fmt: skip
+    """Do two photographs show one person? Accuracy over the folds of LFW's protocol, and AUC; 1 is best."""
+    own = {"pairs": pairs, "half": images.half, "untrained_seeds": untrained_seeds}
+    scoring.score("verify", published, images, subject, **vars(computed), **own)

@@ -6,13 +6,11 @@ from typing import Annotated, Any
 import typer
 
 from derender.cli import options, scoring
-from derender.cli.console import progress_bar
+from derender.cli.options import option
 
 TABLE = ".npz, .csv or .parquet with name and the angles in degrees; default: labels."
 Angles = Annotated[str | None, typer.Option("--table", metavar="FILE", help=TABLE)]
-Size = Annotated[int, scoring.number(help="Side in pixels of the images that are relit.")]
 BY = "Without true albedo: label of the groups to compare, as race."
-By = Annotated[str | None, typer.Option(metavar="LABEL", help=BY)]
 
 
 @dataclass(frozen=True)
@@ -27,14 +25,8 @@ class Decomposed(options.TrainedModel):
         self, protocol: str, images: options.DataOptions, published: scoring.Published, **how: Any
     ) -> None:
         """Score by a protocol of `derender.evaluation`, and publish."""
-        from derender import evaluation
-
-        published.check()
-        model, own = self.open(), {name: getattr(self, name) for name in ("fit_steps", "resamples", "seed")}
-        with progress_bar("decomposing") as progress:
-            found = getattr(evaluation, protocol)(
-                model, images.address, **images.how, **own, **how, progress=progress
-            )
+        how |= {"fit_steps": self.fit_steps, "resamples": self.resamples, "seed": self.seed, **images.how}
+        found = scoring.measured(protocol, self.open(), images.address, doing="decomposing", **how)
         published.publish(found, half=images.half)
 
 
@@ -53,8 +45,9 @@ def light(
 
 
 def relight(
-    images: options.DataOptions, model: Decomposed, published: scoring.Published, size: Size = 128
-) -> None:
+    images: options.DataOptions, model: Decomposed, published: scoring.Published,
+    size: int = scoring.number(128, "Side in pixels of the images that are relit."),
+) -> None:  # fmt: skip
     """Relit images against photographs in that light: PSNR and SSIM inside the mask, beside controls.
 
     The light is predicted for another person's image. Images: the cropped Extended Yale B, or others with
@@ -64,7 +57,8 @@ def relight(
 
 
 def brightness(
-    images: options.DataOptions, model: Decomposed, published: scoring.Published, by: By = None
-) -> None:
+    images: options.DataOptions, model: Decomposed, published: scoring.Published,
+    by: str | None = option(None, BY, metavar="LABEL"),
+) -> None:  # fmt: skip
     """Is albedo as bright as the surface? Slope and r on rendered images; by group on photographs."""
     model.score("brightness", images, published, by=by)

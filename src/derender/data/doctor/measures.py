@@ -1,15 +1,14 @@
 """What is measured of images: brightness, colour, near copies; what they share, and in what they vary.
 
-Greys are 0.299 R + 0.587 G + 0.114 B of the values as stored (ITU-R BT.601). Each image becomes a grid of 6 x
-6 cells with the strength of edges in eight orientations (after Dalal and Triggs, HOG, 2005). The mean of each
-row of cells is taken off, and the length is 1. Taking off rows distinguishes an object from a landscape.
-Images that look alike however they are shifted sideways (noise, textures, sky over hills) then agree by 0.
-Edges do not care which side of an outline is darker, so one kind of thing in many colours agrees.
+Each image becomes a grid of 6 x 6 cells with the strength of edges in eight orientations (after Dalal and
+Triggs, HOG, 2005). The mean of each row of cells is taken off, and the length is 1: images that look alike
+however they are shifted sideways (noise, textures, sky over hills) then agree by 0. Edges do not care which
+side of an outline is darker, so one kind of thing in many colours agrees.
 
 View: how far an image is from its own mirror image, against how far it is from other images' mirror images.
-Light: how much brighter the left of the image's middle is than the right, in its upper and its lower half.
-Light from the side moves both halves together, marks and noise do not: what the halves share is counted.
-Leaves out light from above or below, views that differ by tilt alone, and more than two kinds of thing.
+Light: how much brighter the left of the image's middle is than the right. Light from the side moves its upper
+and its lower half together, marks and noise do not: what the halves share is counted. Leaves out light from
+above or below, views that differ by tilt alone, and more than two kinds of thing.
 """
 
 from collections.abc import Callable

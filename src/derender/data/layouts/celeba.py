@@ -1,18 +1,14 @@
-"""CelebA: 202,599 faces of 10,177 people with 40 attributes, aligned or in the wild; and CelebAMask-HQ.
+"""CelebA, aligned or in the wild, and CelebAMask-HQ; docs/reference/data-sets.md describes their files.
 
-Lists are read as the owners publish them and as their CSV copies; only the attributes must be there. Aligned
-images (``img_align_celeba``) are used whole. Images in the wild (``img_celeba``) show a scene with a face in
-it, so each gets a square box about its face:
+Lists are read as the owners publish them and as their CSV copies. Images in the wild get a square box about
+each face, from a list of the user's own or from the landmarks. The latter is the box of CelebA-HQ without its
+rotation (Karras et al., Progressive Growing of GANs, 2018, appendix C). E is the eyes' middle, e their
+distance, M the middle of the mouth's corners, m = |E - M|. The side is max(4 e, 3.6 m), the middle E + 0.1 (E
+- M).
 
-- from a list of the user's own, ``boxes.csv``, with a row for each image. Its first line is
-  ``file,left,top,width,height`` or ``file,left,top,right,bottom``;
-- else from ``list_landmarks_celeba.txt``, the box of CelebA-HQ without its rotation (Karras et al.,
-  Progressive Growing of GANs, 2018, appendix C). E is the eyes' middle, e their distance, M the middle of the
-  mouth's corners, m = |E - M|. The side is max(4 e, 3.6 m), the middle E + 0.1 (E - M).
-
-CelebAMask-HQ: 30,000 faces with a mask of 19 classes each, in parts as published or merged. Its mapping to
-CelebA gives the official partition. The owners' own script compares that table's count from zero with
-CelebA's numbers, which start at one. Here an image is in the part in which CelebA has it.
+Masks come in parts as published, or merged. The owners' own script for the official partition compares a
+count from zero with CelebA's numbers, which start at one. Here an image is in the part in which CelebA has
+it.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,21 +1,9 @@
 """Real faces: UTKFace, Labeled Faces in the Wild, Yale B, RAF-DB, and faces followed through a video.
 
-UTKFace: ``[age]_[gender]_[race]_[date].jpg.chip.jpg``. Its owners give no split; the paper's 80/10/10 is
-made by data/splits.py. Extended Yale B, cropped: ``yaleB01_P00A+035E-20.pgm`` has the light at azimuth 35
-degrees (positive lights the left of the image) and elevation -20. Images in ambient light alone are left out,
-and crops are given room (data/image.py). LFW: ``First_Last/First_Last_0001.jpg``; where the lists of its view
-1 (``peopleDevTrain.txt``, ``peopleDevTest.txt``: a count, then a name and a count a line) lie beside the
-images they are the official split by people.
-
-RAF-DB, the basic set: ``basic/Image/aligned/train_00001_aligned.jpg`` (the name tells the part) and
-``basic/EmoLabel/list_patition_label.txt``, spelt so, with a line ``train_00001.jpg 5`` for each image. The
-images before alignment and the compound emotions are not read.
-
-Tracks have two forms: ``NAME.ids`` as published for The Big Bang Theory and Buffy
-(github.com/makarandtapaswi/BallClustering_ICCV2019, after Baeuml et al., CVPR 2013). Frames cut from the
-video lie in ``NAME/NUMBER/FRAME.jpg``, where ``NAME/`` may be left out if there is one list only. Or, without
-a list, ``IDENTITY/TRACK/FRAME.jpg`` as in YouTube Faces, where tracks and frames are numbered. Every track of
-a list is read, background people (unknown_...) too.
+Their files are described in docs/reference/data-sets.md. Of Extended Yale B, ``yaleB01_P00A+035E-20.pgm`` has
+the light at azimuth 35 degrees (positive lights the left of the image) and elevation -20. Images in ambient
+light alone are left out, and crops are given room (data/image.py). Of RAF-DB the images before alignment and
+the compound emotions are not read. Every track of a list is read, background people (unknown_...) too.
 """
 
 import re

@@ -1,21 +1,11 @@
 """Rendered collections: exact factors of every image in a params.csv, depth maps, or cars from ShapeNet.
 
-synface and syncar: folders with ``images`` beside a ``params.csv``. Tracks: ``tracks/IDENTITY/TRACK/FRAME``.
-Angles become radians here; light and camera are canonical (docs/reference/conventions.md). Images with
-depth maps in folders side by side, as unsup3d's synthetic faces lie:
-
-    SET/image/NAME.png          the image; SET is train, val or test, or nothing
-    SET/depth/NAME.png          its depth map, NAME the same or with "image" replaced by "depth"
-
-ShapeNet's cars: folders train, val and test of images whose paths hold the model's id.
-unsup3d released the paper's images (github.com/elliottwu/unsup3d, issue 18). Those of 128 x 128 are cropped
-to rows 8 to 108 and columns 14 to 114. Untested on the archive itself: a model's id is taken to be 24 to 32
-hexadecimal digits in the path. Images named by such digits may be anything. So the layout is recognised only
-beside ShapeNet's table or below a folder 02958343, the number of its cars. Else ask for it by name. That
-table (``02958343.csv`` or ``metadata.csv``) gives names, and by words in them the label ``class``, one of
-five or "". The paper's fifth is Ferrari, which is among its words here.
-
-All maps are read by data/maps.py.
+Their files are described in docs/reference/data-sets.md. Angles become radians here; light and camera are
+canonical (docs/reference/conventions.md). unsup3d released the paper's cars (github.com/elliottwu/unsup3d,
+issue 18). Untested on the archive itself: a model's id is taken to be 24 to 32 hexadecimal digits in the
+path. Images named by such digits may be anything. So the layout is recognised only beside ShapeNet's table or
+below a folder 02958343, the number of its cars. Words in that table give the label ``class``, one of five or
+"". The paper's fifth is Ferrari, which is among its words here. All maps are read by data/maps.py.
 """
 
 import math

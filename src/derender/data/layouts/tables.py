@@ -1,14 +1,9 @@
-"""Images and labels from a table: CSV or Parquet, one row for each image.
+"""Images and labels from a table, CSV or Parquet: one row for each image (docs/reference/data-sets.md).
 
-``data.csv`` (or metadata.csv, data.parquet, metadata.parquet) beside the images, in a folder or a zip. Or any
-table of that kind given in place of a folder. Paths are relative to the table, and none leaves its folder.
-One column, named file, path, image, file_name or filename, holds them; every other column is a label:
-
-- a column ``split`` or ``partition`` of nothing but train, val, test and the like is the official split;
-- true and false, yes and no, or 0 and 1 only: a yes/no attribute;
-- numbers are numbers, unless they are names in disguise: leading zeros, or whole numbers that a float32
-  cannot hold;
-- anything else is text. Empty cells are unknown.
+Paths are relative to the table, and none leaves its folder. A column ``split`` or ``partition`` of nothing
+but train, val, test and the like is the official split. True and false, yes and no, or 0 and 1 only are a
+yes/no attribute. Numbers are numbers, unless they are names in disguise: leading zeros, or whole numbers that
+a float32 cannot hold. Anything else is text. Empty cells are unknown.
 """
 
 import math

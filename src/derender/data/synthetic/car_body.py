@@ -2,15 +2,13 @@
 
 Stations run along the body's outline seen from the side. In front: 0 lower lip, 1 bumper, 2 nose, 3 cowl, 4
 upper edge of the windscreen. Behind: 5 end of the roof, 6 lower edge of the window, 7 upper edge of the tail,
-8 bumper, 9 lower lip. A row of numbers at each station has the places of the car's middle, upper edge, waist
-and sill. The waist is the windows' lower edge, or the shoulder of bonnet and boot. Between stations rows are
-interpolated linearly with rounded corners. Across, the surface goes from the middle over the crowned top to
-the edge. Then it goes down the glass to the waist, and down the side to the sill. The half with x > 0 is
-mirrored, so the body is exactly symmetric. Wheel arches are holes of the paint.
+8 bumper, 9 lower lip. Across, the surface goes from the middle over the crowned top to the edge, and down the
+glass to the waist. The waist is the windows' lower edge, or the shoulder of bonnet and boot. Then it goes
+down the side to the sill. The half with x > 0 is mirrored, so the body is exactly symmetric. Wheel arches are
+holes of the paint.
 
 Points are metres, x right, y UP from the ground, z from the front to the rear; ``join`` turns y down. A
-grid's columns and rows are ordered so that d/dcolumn x d/drow points inwards, as the conventions' normals do.
-Leaves out undersides.
+grid's columns and rows are ordered so that d/dcolumn x d/drow points inwards. Leaves out undersides.
 """
 
 from collections.abc import Sequence

@@ -1,18 +1,14 @@
 """Procedural cars: class, shape, paint, light and view are drawn, the car is rendered with exact truth.
 
-Twelve classes: seven body styles and five that differ by more than their body (police, ambulance, limousine,
-jeep, sports). Measures are metres and, along the car, distance from the front bumper: a row of ``cars.yaml``
-for each body style (typical outside measures of road cars, rounded) times small independent factors. Paint
-is drawn from short lists of usual colours. Wheels, mirrors, light bars, wings, rails, an ambulance's box, a
-jeep's fittings: everything mounted on the body is a rounded box or a wheel. It is placed by the body's
-measures, in mirror images or across the middle. Leaves out rust, dirt and damage; no existing car is drawn.
+Twelve classes: seven body styles and five that differ by more than their body. Measures are metres: a row of
+``cars.yaml`` for each body style (typical outside measures of road cars, rounded) times small independent
+factors. Everything mounted on the body is a rounded box or a wheel, placed by the body's measures, in mirror
+images or across the middle. Leaves out rust, dirt and damage; no existing car is drawn.
 
-Each image is a function of the seed and its index alone: asking for more images does not change the first
-ones, nor does the number of threads. Conventions are those of reference/conventions.md and of `syncar`: a
-car's bounding box is centred on (0, 0, 1). The view is a turntable's: M = Rz(inplane) Rx(elevation)
-Ry(azimuth) takes the upright car, front towards the viewer, to the camera. The canonical frame is the car
-seen from straight ahead and 42.5 degrees above. So the camera's rotation is R = M Rx(42.5)^-1, given by its
-Euler angles."""
+Each image is a function of the seed and its index alone. The view is a turntable's: M = Rz(inplane)
+Rx(elevation) Ry(azimuth) takes the upright car, front towards the viewer, to the camera. The canonical frame
+is the car seen from straight ahead and 42.5 degrees above: the camera's rotation is R = M Rx(42.5)^-1.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

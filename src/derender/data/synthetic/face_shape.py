@@ -3,14 +3,12 @@
 A face is a grid of free 3D points, rows (down the face) times columns (around the head). Column angle
 ``theta`` turns around the vertical axis of the head (0 = the middle of the face, positive to the right of the
 image). Row coordinate ``q`` runs down the face. ``p`` is the sideways coordinate in which features are
-placed: like x near the front, the arc length further back. Unit: one pixel of a 64-pixel image at z = 1, eyes
-at (+-12, -14), mouth at (0, 14), as on a mean face. All shapes and skins are smooth functions of this domain,
-so a finer grid shows the same face in more detail.
+placed: like x near the front, the arc length further back. Unit: one pixel of a 64-pixel image at z = 1. All
+shapes are smooth functions of this domain, so a finer grid shows the same face in more detail.
 
-Points have the camera's axes: x right, y down, z away from the viewer. The mean head is elliptic sections
-plus hills. Their heights, places and widths were fitted by least squares to the average neutral surface of
-ICT-FaceKit (MIT licence; 0.2 face pixels rms). Numbers stand in ``faces.yaml``. Leaves out the back of the
-head, the tongue's motion, blinks, and puckered lips.
+Points have the camera's axes. The mean head is elliptic sections plus hills. They were fitted to the average
+neutral surface of ICT-FaceKit (MIT licence; 0.2 face pixels rms). Numbers stand in ``faces.yaml``. Leaves out
+the back of the head, the tongue's motion, blinks, and puckered lips.
 """
 
 from dataclasses import dataclass

@@ -1,11 +1,9 @@
 """The colour of a face (albedo free of shading), its parts, and the hair that grows on it.
 
-Skin tone with mottling, blush, freckles, lines of age and stubble; lips; brows; hair; beard; clothes. Hair is
-part of the head's surface. It grows above a line around the head, given as a row ``q`` for each angle. It
-lifts the surface by its thickness, with a soft, uneven edge. Eyes and the inside of the mouth change from
-image to image and are painted over it: lids follow the expression, irises the gaze; the mouth's inside shows
-teeth, dark and tongue as far as the lips have parted. Colours only: no highlights, since albedo holds no
-light. Leaves out single strands, plaits, and hair that hangs free of the head.
+Hair is part of the head's surface: it grows above a line around the head, given as a row ``q`` for each
+angle, and lifts the surface by its thickness. Eyes and the inside of the mouth change from image to image and
+are painted over it: lids follow the expression, irises the gaze; the mouth's inside shows as far as the lips
+have parted. Leaves out highlights, single strands, plaits, and hair that hangs free of the head.
 """
 
 from functools import lru_cache

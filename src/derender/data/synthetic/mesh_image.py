@@ -1,13 +1,10 @@
 """Triangle meshes to images with exact ground truth: a fast forward-only z-buffer, for faces and cars.
 
 Each pixel takes 3 x 3 samples (offsets -1/3, 0, 1/3). The image is their mean, truth maps are the middle
-sample alone, at the pixel's centre. Normals, colours and charts are interpolated with perspective. A face has
-a colour and a part at each vertex. A car's triangles lie on painted surfaces: each has a colour, a part, and
-flat shapes (decals) on its chart, a pair of coordinates that the mesh carries. Shapes are looked up at every
-sample: their edges are as sharp at 512 pixels as at 32. The last shape that holds a point wins. Unlike
-``derender.render`` this needs no gradient. Gloss, shadows and haze: lighting.py. Leaves out what is seen from
-behind. Numba's cache on disk refers to the named tuples by name: who renames one renames the kernels that
-take it.
+sample alone, at the pixel's centre. Normals, colours and charts are interpolated with perspective. Painted
+shapes (decals.py) are looked up at every sample: their edges are as sharp at 512 pixels as at 32. Unlike
+``derender.render`` this needs no gradient. Leaves out what is seen from behind. Numba's cache on disk refers
+to the named tuples by name: who renames one renames the kernels that take it.
 """
 
 from functools import lru_cache

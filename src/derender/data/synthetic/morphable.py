@@ -1,21 +1,9 @@
-"""A user's own morphable model instead of the built-in faces: a documented .npz file.
-
-    mean          (V, 3)     mean shape: x to the right of the image, y UP, z towards the viewer; any unit
-    triangles     (F, 3)     vertex numbers, counter-clockwise seen from outside
-    components    (K, V, 3)  displacement by each component
-    std           (K,)       spread of its coefficient among people
-    texture_mean  (V, 3)     optional: RGB reflectance 0..1; else each identity has a plain skin colour
-    texture_components (T, V, 3), texture_std (T,)   optional
-    parts         (V,)       optional: CelebAMask-HQ class number of each vertex; else all is skin (1)
-    colours       (V, 3)     optional: RGB where a part has its own colour (eyes, teeth); NaN elsewhere
-    expressions   (E, V, 3)  optional: displacement of each expression at full strength
-    expression_names (E,)    optional: names from neutral happiness sadness surprise anger disgust fear
-    unit          ()         optional: how many of the file's units span the image at z = 1
-    centre        (3,)       optional: the point that lies in the middle of the image
+"""A user's own morphable model instead of the built-in faces: the .npz file of docs/how-to/generate.md.
 
 The nose tip (the front-most vertex of the mean) is brought to z = 0.947 as in the built-in faces. Without
-``unit`` the mean's width fills 0.9 of the image, without ``centre`` its bounding box is centred. Eyes do
-not look around and lids do not move unless the expressions say so.
+``unit``, how many of the file's units span the image at z = 1, the mean's width fills 0.9 of the image.
+Without ``centre`` its bounding box is centred. Without textures each identity has a plain skin colour. A
+colour of NaN is none. Eyes do not look around and lids do not move unless the expressions say so.
 """
 
 import struct

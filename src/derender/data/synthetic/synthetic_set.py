@@ -1,15 +1,10 @@
 """The set of images that generators return, drawn on threads, and written; and the backgrounds they share.
 
 A generator gives the meshes, light and view of a run of consecutive images that show one object. Here they
-are drawn into the rows of the result. So threads decide when an image is made and nothing else.
-
-A set is written in the layout of the rendered data sets: ``images/NNNNNN.jpg`` (JPEG quality 92, 4:4:4),
-``params.csv`` (degrees), ``identities.csv``. With truth, as PNG: ``depth/`` (16 bit, z = 0.8 +
-value/65535*0.4, 0 = background), ``normal/`` (round((n+1)/2*255)), ``albedo/``, ``mask/`` (255 = object).
-``masks/`` has the number of the part, named line by line in ``classes.txt``. With effects also ``shading/``,
-``visible/``, ``highlight/`` and ``transmission/`` (16 bit, value/65535*2). Tracks lie at
-``tracks/idNNNN/track_NNN/NNN.jpg`` without maps. The column ``expr_weights`` of the morphable-model sets has
-no counterpart here.
+are drawn into the rows of the result. So threads decide when an image is made and nothing else. A set is
+written in the layout of the rendered data sets (docs/reference/files.md): JPEG of quality 92 (4:4:4), and
+maps as PNG. Depth is z = 0.8 + value/65535*0.4, an effect value/65535*2, both of 16 bits. The column
+``expr_weights`` of the morphable-model sets has no counterpart here.
 """
 
 import csv

@@ -241,13 +241,8 @@ def disentangle(
         check_finite(found, images.files)
         return found
 
-    def correlations() -> dict[str, np.ndarray]:
-        lengths = np.array([values.shape[1] for values in features().values()])
-        names = np.array(list(features()))
-        return {"names": names, "sizes": lengths, "correlations": correlation_matrix(features())}
-
-    whole = kept.recall("card-correlations", inputs, correlations)
-    sizes = dict(zip(whole["names"].tolist(), whole["sizes"].tolist(), strict=True))
+    sizes = {name: values.shape[1] for name, values in embed_images(model, pixels[:1]).items()}
+    correlations = kept.recall_one("card-correlation", inputs, lambda: correlation_matrix(features()))
 
     @cache
     def components() -> np.ndarray:
@@ -283,7 +278,7 @@ def disentangle(
             )
             if progress is not None:
                 progress(sum(map(len, rows.values())), len(seeds) * len(rows))
-    card = DisentanglementCard(tuple(sizes), rows, whole["correlations"], tuple(sizes.values()), len(images))
+    card = DisentanglementCard(tuple(sizes), rows, correlations, tuple(sizes.values()), len(images))
     tables, places = card.tables(), list(_SUMMARY.values())
     notes = [f"swap test: {tables[0].verdict(places.index(_SWAP))}"]
     notes += [f"swap test, decoded: {tables[0].verdict(places.index(_DECODED))}"]

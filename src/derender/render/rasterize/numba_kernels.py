@@ -5,7 +5,6 @@ a z-buffer. Arithmetic is float64 in the order of operations of ``reference.py``
 """
 
 from math import ceil, floor
-from typing import no_type_check
 
 import numpy as np
 
@@ -23,7 +22,6 @@ TIED = 1 - TIE_TOLERANCE
 
 
 @kernel
-@no_type_check
 def project(points, focal, screen):
     """Write where points (H, W, 3) land in the image and their inverse depth, 0 for one left out."""
     height, width = points.shape[0], points.shape[1]
@@ -41,7 +39,6 @@ def project(points, focal, screen):
 
 
 @kernel
-@no_type_check
 def choose_in(screen, nearest, held, triangle):
     """Write the visible triangle of each pixel of one image, or -1; ``nearest`` and ``held`` are scratch."""
     us, vs, inverse_zs = screen[0], screen[1], screen[2]
@@ -101,7 +98,6 @@ def choose_in(screen, nearest, held, triangle):
 
 
 @kernel
-@no_type_check
 def choose(screen, triangle, start, stop):
     """Write the visible triangle of each pixel, or -1."""
     size = triangle.shape[1], triangle.shape[2]

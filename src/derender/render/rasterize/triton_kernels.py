@@ -7,13 +7,10 @@ positive float's bits order like the float), so the order of lanes changes nothi
 float64 in the order of operations of ``reference.py``.
 """
 
-from typing import no_type_check
-
-import triton
 import triton.language as tl
 
 from derender.render.rasterize import reference as rule
-from derender.render.triton_parts import lanes
+from derender.render.triton_parts import kernel, lanes
 
 NEAR_Z = tl.constexpr(rule.NEAR_Z)
 MIN_TWICE_AREA_PX2 = tl.constexpr(rule.MIN_TWICE_AREA_PX2)
@@ -24,8 +21,7 @@ TIED = tl.constexpr(1 - rule.TIE_TOLERANCE)
 NO_TRIANGLE = tl.constexpr(rule.NO_TRIANGLE)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def project(x, y, z, focal, place, live, us, vs, inverse_zs, height, width):
     """Write where vertices land in the image and their inverse depth; 0 for that marks one left out."""
     seen = z > NEAR_Z
@@ -38,8 +34,7 @@ def project(x, y, z, focal, place, live, us, vs, inverse_zs, height, width):
     tl.store(inverse_zs + place, tl.where(seen, inverse_z, 0.0), mask=live)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def corners(triangle, width):
     """Row and column of a triangle's three vertices."""
     half, cell = triangle % 2, triangle // 2
@@ -47,8 +42,7 @@ def corners(triangle, width):
     return i, j + half, i + half, j + 1, i + 1, j
 
 
-@triton.jit
-@no_type_check
+@kernel
 def choose(
     us, vs, inverse_zs, nearest_bits, nearest, first, height, width, SECOND: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -107,8 +101,7 @@ def choose(
         q = tl.where(ended, q + 1, q)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen):
     """Where rays (ray_x, ray_y, 1) meet triangles: barycentric weights, and what their derivative needs."""
     x0, y0 = x0 - ray_x * z0, y0 - ray_y * z0
@@ -119,8 +112,7 @@ def meet(ray_x, ray_y, x0, y0, z0, x1, y1, z1, x2, y2, z2, seen):
     return w0 * scale, w1 * scale, w2 * scale, scale, x0, y0, x1, y1, x2, y2
 
 
-@triton.jit
-@no_type_check
+@kernel
 def meet_backward(gb0, gb1, gb2, b0, b1, b2, scale, x0, y0, x1, y1, x2, y2):
     """From derivatives by the barycentric weights to derivatives by the vertices' x and y."""
     mean = b0 * gb0 + b1 * gb1 + b2 * gb2

@@ -4,15 +4,12 @@ Rows are worked on whole, so that the compiler can take several pixels at once. 
 dtype; the lamp's gradient is summed in float64.
 """
 
-from typing import no_type_check
-
 import numpy as np
 
 from derender.render.numba_threads import kernel
 
 
 @kernel
-@no_type_check
 def row_slopes(depth, i, along_u, along_v):
     """Write row i's relative slopes along both axes, as ``scene/normals.py`` defines them."""
     width, row = depth.shape[1], depth[i]
@@ -26,7 +23,6 @@ def row_slopes(depth, i, along_u, along_v):
 
 
 @kernel
-@no_type_check
 def neighbours(rows, i):
     """The rows above and below row i, itself at the border, and which of them its slope's divisor counts."""
     last, one, none = len(rows) - 1, rows.dtype.type(1), rows.dtype.type(0)
@@ -34,7 +30,6 @@ def neighbours(rows, i):
 
 
 @kernel
-@no_type_check
 def forward(depth, albedo, lamp, focal, image, start, stop):
     """Write albedo times shading."""
     channels, height, width = albedo.shape[1], albedo.shape[2], albedo.shape[3]
@@ -59,7 +54,6 @@ def forward(depth, albedo, lamp, focal, image, start, stop):
 
 
 @kernel
-@no_type_check
 def backward(grad, depth, albedo, lamp, focal, grad_depth, grad_albedo, grad_lamp, start, stop):
     """Write the derivatives by depth, albedo and lamp (overwrites all three outputs)."""
     channels, height, width = albedo.shape[1], albedo.shape[2], albedo.shape[3]

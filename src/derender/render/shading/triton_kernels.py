@@ -5,16 +5,12 @@ does. ``backward`` leaves the derivatives by the two slopes. ``gather`` collects
 pixels whose slope it entered: nothing is added by two lanes.
 """
 
-from typing import no_type_check
-
-import triton
 import triton.language as tl
 
-from derender.render.triton_parts import float64, lanes
+from derender.render.triton_parts import float64, kernel, lanes
 
 
-@triton.jit
-@no_type_check
+@kernel
 def slope(depth, place, step, at, size, live):
     """(next - previous) / (next + previous) along an axis; one-sided over its nearer value at the border."""
     before = tl.load(depth + place - tl.where(at > 0, step, 0), mask=live, other=1)
@@ -23,8 +19,7 @@ def slope(depth, place, step, at, size, live):
     return (after - before) / below
 
 
-@triton.jit
-@no_type_check
+@kernel
 def cosine(depth, lamp, n, pixel, live, focal, height, width):
     """Cosine between normal and light with what its derivative needs: the normal, its length, the light."""
     i, j, place = pixel // width, pixel % width, n * height * width + pixel
@@ -39,8 +34,7 @@ def cosine(depth, lamp, n, pixel, live, focal, height, width):
     return x * light_x + y * light_y + z * light_z, x, y, z, length, light_x, light_y, light_z, u, v
 
 
-@triton.jit
-@no_type_check
+@kernel
 def forward(
     depth, albedo, lamp, image, focal_bits, height, width, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
 ):
@@ -48,13 +42,12 @@ def forward(
     focal = float64(focal_bits).to(depth.dtype.element_ty)
     facing, _, _, _, _, _, _, _, _, _ = cosine(depth, lamp, n, pixel, live, focal, height, width)
     shading = tl.load(lamp + n * 5) + tl.load(lamp + n * 5 + 1) * tl.maximum(facing, 0.0)
-    for channel in tl.static_range(CHANNELS):
+    for channel in tl.static_range(CHANNELS):  # pyright: ignore[reportGeneralTypeIssues]
         place = (n * CHANNELS + channel) * height * width + pixel
         tl.store(image + place, tl.load(albedo + place, mask=live, other=0) * shading, mask=live)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def backward(
     grad, depth, albedo, lamp, grad_albedo, grad_slope_u, grad_slope_v, grad_lamp, focal_bits, height, width,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -68,7 +61,7 @@ def backward(
     diffuse, lit = tl.load(lamp + n * 5 + 1), tl.maximum(facing, 0.0)
     shading = tl.load(lamp + n * 5) + diffuse * lit
     by_shading = facing * 0
-    for channel in tl.static_range(CHANNELS):
+    for channel in tl.static_range(CHANNELS):  # pyright: ignore[reportGeneralTypeIssues]
         place = (n * CHANNELS + channel) * height * width + pixel
         gradient = tl.load(grad + place, mask=live, other=0)
         by_shading += gradient * tl.load(albedo + place, mask=live, other=0)
@@ -88,8 +81,7 @@ def backward(
     tl.store(part + 4, tl.sum(tl.where(live, by_cosine * z, 0.0), 0))
 
 
-@triton.jit
-@no_type_check
+@kernel
 def from_slopes(grad_slope, depth, place, step, at, size, live):
     """The derivative by a pixel's depth through the slopes along one axis that it entered."""
     own = tl.load(depth + place, mask=live, other=1)
@@ -113,8 +105,7 @@ def from_slopes(grad_slope, depth, place, step, at, size, live):
     return total + tl.where(at == size - 1, slope_own / before, 0.0)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def gather(depth, grad_slope_u, grad_slope_v, grad_depth, height, width, BLOCK: tl.constexpr):
     n, pixel, live = lanes(height * width, BLOCK)
     place = n * height * width + pixel

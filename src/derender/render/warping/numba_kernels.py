@@ -4,8 +4,6 @@ Where the surface lands and what a pixel shows is float64 arithmetic; colours ar
 dtype. The moved points of one image at a time are in scratch memory and stay in the processor's cache.
 """
 
-from typing import no_type_check
-
 import numpy as np
 
 from derender.render.numba_threads import kernel
@@ -13,7 +11,6 @@ from derender.render.rasterize.numba_kernels import choose_in, project
 
 
 @kernel
-@no_type_check
 def move(depth, rotation, offset, focal, points):
     """Write one image's surface points in the camera's frame."""
     height, width = depth.shape
@@ -31,7 +28,6 @@ def move(depth, rotation, offset, focal, points):
 
 
 @kernel
-@no_type_check
 def meet(flat, triangle, width, ray_x, ray_y):
     """Where the ray (ray_x, ray_y, 1) meets a triangle's plane.
 
@@ -50,7 +46,6 @@ def meet(flat, triangle, width, ray_x, ray_y):
 
 
 @kernel
-@no_type_check
 def corner(coordinate, size):
     """First pixel, along an axis, of the cell that holds a coordinate; the border cells are continued."""
     if not coordinate > 0:
@@ -59,7 +54,6 @@ def corner(coordinate, size):
 
 
 @kernel
-@no_type_check
 def forward(image, depth, rotation, offset, focal, colour, seen_depth, mask, triangle, start, stop):
     """Write the image, its depth and mask, and the triangle each pixel shows."""
     channels, height, width = image.shape[1], image.shape[2], image.shape[3]
@@ -102,7 +96,6 @@ def forward(image, depth, rotation, offset, focal, colour, seen_depth, mask, tri
 
 
 @kernel
-@no_type_check
 def backward(
     grad_colour, grad_seen_depth, image, depth, rotation, offset, triangle, focal,
     grad_image, grad_depth, grad_rotation, grad_offset, start, stop,
@@ -165,7 +158,6 @@ def backward(
 
 
 @kernel
-@no_type_check
 def add(point, x, y, z):
     point[0] += x
     point[1] += y
@@ -173,7 +165,6 @@ def add(point, x, y, z):
 
 
 @kernel
-@no_type_check
 def move_backward(by_points, depth, rotation, focal, grad_depth, grad_rotation, grad_offset):
     """Write the derivative of ``move``: of one image's depth map and motion."""
     height, width = depth.shape

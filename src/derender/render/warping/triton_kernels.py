@@ -6,17 +6,13 @@ pixel shows. ``show`` meets the pixel's ray with its triangle and looks the colo
 times its depth, plus offset, in float64. Colours are computed in the image's own dtype.
 """
 
-from typing import no_type_check
-
-import triton
 import triton.language as tl
 
 from derender.render.rasterize.triton_kernels import NO_TRIANGLE, corners, meet, meet_backward, project
-from derender.render.triton_parts import accumulate, float64, lanes, magnitude, note_largest
+from derender.render.triton_parts import accumulate, float64, kernel, lanes, magnitude, note_largest
 
 
-@triton.jit
-@no_type_check
+@kernel
 def cell(u, v, height, width):
     """Row and column of the cell that holds (u, v), border cells continued, and where in it the point lies.
 
@@ -27,8 +23,7 @@ def cell(u, v, height, width):
     return i, j, u - j, v - i
 
 
-@triton.jit
-@no_type_check
+@kernel
 def look_up(image, place, across, down, width, seen):
     """The value at a point, and its derivatives along u and v."""
     a = tl.load(image + place, mask=seen, other=0)
@@ -41,8 +36,7 @@ def look_up(image, place, across, down, width, seen):
     return upper * (1 - down) + lower * down, along_u, along_v
 
 
-@triton.jit
-@no_type_check
+@kernel
 def spread(grad_image, place, gradient, across, down, width, seen, unit, MODE: tl.constexpr):
     """Add a pixel's gradient to the four values it was made of."""
     accumulate(grad_image + place, gradient * (1 - across) * (1 - down), seen, unit, MODE)
@@ -51,8 +45,7 @@ def spread(grad_image, place, gradient, across, down, width, seen, unit, MODE: t
     accumulate(grad_image + place + width + 1, gradient * across * down, seen, unit, MODE)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def surface(depth, rotation, offset, n, i, j, focal, height, width, live):
     """Vertex (i, j) of image n: its depth, its ray (x, y, 1), the ray turned, the point for the camera."""
     distance = tl.load(depth + n * height * width + i * width + j, mask=live, other=0).to(tl.float64)
@@ -66,8 +59,7 @@ def surface(depth, rotation, offset, n, i, j, focal, height, width, live):
     return distance, ray_x, ray_y, turned_x, turned_y, turned_z, x, y, distance * turned_z + tl.load(t + 2)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def project_depth(
     depth, rotation, offset, us, vs, inverse_zs, focal_bits, height, width, BLOCK: tl.constexpr
 ):
@@ -77,8 +69,7 @@ def project_depth(
     project(x, y, z, focal, n * height * width + pixel, live, us, vs, inverse_zs, height, width)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def show(
     image, depth, rotation, offset, triangle, colour, seen_depth, mask, focal_bits, height, width,
     CHANNELS: tl.constexpr, BLOCK: tl.constexpr,
@@ -103,14 +94,13 @@ def show(
     u = tl.where(seen, b0 * j0 + b1 * j1 + b2 * j2, 0.0).to(kind)
     v = tl.where(seen, b0 * i0 + b1 * i1 + b2 * i2, 0.0).to(kind)
     i, j, across, down = cell(u, v, height, width)
-    for channel in tl.static_range(CHANNELS):
+    for channel in tl.static_range(CHANNELS):  # pyright: ignore[reportGeneralTypeIssues]
         plane = (n * CHANNELS + channel) * height * width
         value, _, _ = look_up(image, plane + i * width + j, across, down, width, seen)
         tl.store(colour + plane + pixel, tl.where(seen, value, 0.0), mask=live)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def show_backward(
     grad_colour, grad_depth_seen, image, depth, rotation, offset, triangle, grad_motion,
     grad_image, grad_depth, units, largest, focal_bits, height, width,
@@ -142,7 +132,7 @@ def show_backward(
     gu, gv = across * 0, down * 0
     most = magnitude(gu, seen)
     image_unit, depth_unit = tl.load(units + n * 2), tl.load(units + n * 2 + 1)
-    for channel in tl.static_range(CHANNELS):
+    for channel in tl.static_range(CHANNELS):  # pyright: ignore[reportGeneralTypeIssues]
         plane = (n * CHANNELS + channel) * height * width
         gradient = tl.load(grad_colour + plane + pixel, mask=seen, other=0)
         at = plane + i * width + j
@@ -180,8 +170,7 @@ def show_backward(
         sum_motion(part + 8, gz0, gz1, gz2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen)
 
 
-@triton.jit
-@no_type_check
+@kernel
 def sum_motion(part, g0, g1, g2, d0, d1, d2, rx0, ry0, rx1, ry1, rx2, ry2, seen):
     """Sums over the block that make one row of the rotation's gradient, and one number of the offset's."""
     gd0, gd1, gd2 = g0 * d0, g1 * d1, g2 * d2

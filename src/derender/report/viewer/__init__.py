@@ -2,13 +2,11 @@
 
 questions   requests of the page, checked; uploads to pixels
 studio      requests to images, meshes and archives, without HTTP
-shelf       opened images, in memory only
-neighbours  images to begin with; rows of a feature table near to an image
-guard       hosts, origins and headers that the server accepts; bodies, within a bound of memory
+images      opened images, in memory only; examples; rows of a feature table near to an image
 app         addresses, and bounds on size and time
-server      a socket, and uvicorn on it
+server      a socket, and uvicorn on it; requests that it accepts, and their bodies
 page/       HTML, CSS and JavaScript, which need nothing from elsewhere
 
-Guard, app and server need starlette and uvicorn (``pip install 'derender[view]'``). The API is the page's own
+App and server need starlette and uvicorn (``pip install 'derender[view]'``). The API is the page's own
 and may change. Leaves out several models at once and anything stored on disk.
 """

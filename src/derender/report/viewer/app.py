@@ -7,10 +7,8 @@ up the sliders of others.
 """
 
 import asyncio
-import json
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -26,10 +24,9 @@ from derender import __version__
 from derender.data import read_photo
 from derender.features import FeatureTable
 from derender.model import Derenderer
-from derender.report.colours import pictures
+from derender.photo import editing_steps
 from derender.report.opening import held_out_errors, readable
-from derender.report.viewer.guard import Body, Guard, Uploads
-from derender.report.viewer.neighbours import Example, Gallery, named_examples, rendered_examples
+from derender.report.viewer.images import KEPT, Example, Gallery, Shelf, rendered_examples
 from derender.report.viewer.questions import (
     BODY_LIMIT_BYTES,
     LARGEST_SIZE,
@@ -37,19 +34,18 @@ from derender.report.viewer.questions import (
     CropRequest,
     FilmRequest,
     NeighbourRequest,
-    Q,
+    Question,
     Refused,
     ViewRequest,
     photo_of,
     read_request,
     too_large,
 )
-from derender.report.viewer.shelf import KEPT, Shelf
-from derender.report.viewer.studio import Studio, data_url
+from derender.report.viewer.server import Body, Guard, Uploads
+from derender.report.viewer.studio import Studio
 
-BODY_SECONDS = 30.0
-WORK_SECONDS, LONG_WORK = 30.0, 6
-"""An answer has to be there; films and fits may take so many times as long."""
+LONG_WORK = 6
+"""Films and fits may take so many times as long as other answers."""
 
 REQUEST_LIMIT_BYTES = 10_000
 UPLOADS_LIMIT_BYTES = 10 * BODY_LIMIT_BYTES
@@ -59,10 +55,9 @@ WAITING_AT_MOST = 200
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
 """So much of a body that is too large is still read and dropped, so that browsers see the answer."""
 
-THUMBNAIL = 96
 MEDIA_TYPES = {
     b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg", b"GIF8": "image/gif", b"glTF": "model/gltf-binary",
-    b"PK": "application/zip",
+    b"PK": "application/zip", b"{": "application/json",
 }  # fmt: skip
 PAGE_FILES = {
     "/": ("index.html", "text/html"),
@@ -70,15 +65,6 @@ PAGE_FILES = {
     "/view.js": ("view.js", "text/javascript"),
     "/surface.js": ("surface.js", "text/javascript"),
 }
-
-
-@dataclass
-class Viewer:
-    """A model, images to begin with, and rows to find neighbours among."""
-
-    studio: Studio
-    examples: Sequence[Example] = ()
-    gallery: Gallery | None = None
 
 
 def open_viewer(
@@ -90,9 +76,9 @@ def open_viewer(
     data: str | None = None,
     dataset: str = "auto",
     keep: int = KEPT,
-    fit_steps: int = 0,
+    fit_steps: int | None = None,
     frame: str | None = None,
-) -> tuple[Viewer, list[str]]:
+) -> tuple[Studio, list[str]]:
     """A model with images to begin with and rows to search, and notes on what is missing.
 
     Args:
@@ -101,7 +87,7 @@ def open_viewer(
         table: features made by this model, for nearest neighbours.
         data, dataset: place of the table's images, if not as the table records it, and its layout.
         keep: opened images held in memory.
-        fit_steps, frame: as ``Studio`` takes them.
+        fit_steps, frame: as ``Studio`` takes them; by default the steps of edits.
     """
     if fit_steps:
         model.features.required_fitting(source)
@@ -112,13 +98,16 @@ def open_viewer(
                 f"the table has none of the factors of {source}: make it again with derender embed"
             )
         gallery = Gallery(table, data, dataset)
-    studio = Studio(model, Path(source).name, Shelf(keep), held_out_errors(source), table, fit_steps, frame)
     read, problems = readable(images, read_photo)
     notes = [f"left out {path}: {reason}" for path, reason in problems.items()]
     if gallery is not None and gallery.without_pictures:
         notes.append(f"neighbours are shown without images: {gallery.without_pictures}")
-    examples = named_examples(read) if images else rendered_examples(source)
-    return Viewer(studio, examples, gallery), notes
+    named = [Example(path.name, pixels) for path, pixels in read.items()]
+    studio = Studio(
+        model, Path(source).name, Shelf(keep), named if images else rendered_examples(source), gallery,
+        held_out_errors(source), editing_steps(model, fit_steps), frame,
+    )  # fmt: skip
+    return studio, notes
 
 
 Answer = Callable[[Request], Awaitable[Response]]
@@ -132,65 +121,49 @@ class Application:
 
     def __init__(
         self,
-        viewer: Viewer,
+        studio: Studio,
         host: str = "127.0.0.1",
-        body_seconds: float = BODY_SECONDS,
-        work_seconds: float = WORK_SECONDS,
+        body_seconds: float = 30.0,
+        work_seconds: float = 30.0,
     ):
-        self.viewer = viewer
+        self.studio = studio
         self.body_seconds, self.work_seconds = body_seconds, work_seconds
         self._computing = ThreadPoolExecutor(1, thread_name_prefix="view-compute")
         self._decoding = ThreadPoolExecutor(1, thread_name_prefix="view-decode")
         self._uploads = Uploads(UPLOADS_LIMIT_BYTES)
         self._waiting = 0
-        studio = viewer.studio
         posts: dict[str, Answer] = {
             "/api/pictures": self.open_upload,
             "/api/examples/{number:int}": self.open_example,
             "/api/rows/{number:int}": self.open_row,
-            "/api/factors": self.factors,
+            "/api/factors": partial(self.made, studio.factors, ViewRequest),
             "/api/neighbours": self.neighbours,
-            "/api/crop": self.crop,
+            "/api/crop": partial(self.made, studio.again, CropRequest, patience=LONG_WORK),
             "/api/film": partial(self.made, studio.film, FilmRequest, patience=LONG_WORK),
-            "/api/settings": self.settings,
+            "/api/settings": partial(self.made, studio.settings_file, ViewRequest),
         }
         makers = ("view", "before", "preview", "picture", "panel", "mesh", "archive")
         posts |= {f"/api/{name}": partial(self.made, getattr(studio, name), ViewRequest) for name in makers}
-        gets = {path: _page_file(*file) for path, file in PAGE_FILES.items()} | {"/api/about": self.about}
+        gets: dict[str, Answer] = {"/api/about": self.about}
+        for path, (name, media_type) in PAGE_FILES.items():
+            content = (files("derender.report.viewer") / "page" / name).read_bytes()
+            gets[path] = partial(_page_file, content, media_type)
         routes = [Route(path, answer, methods=["POST"]) for path, answer in posts.items()]
         routes += [Route(path, answer, methods=["GET"]) for path, answer in gets.items()]
-        handlers: dict[Any, Any] = {
-            HTTPException: _no_such_address, Refused: _refusal, ClientDisconnect: _gone,
-        }  # fmt: skip
+        handlers: dict[Any, Any] = dict.fromkeys((HTTPException, Refused, ClientDisconnect), _problem)
         self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
 
     def close(self) -> None:
         """End the threads and let go of the gallery's source."""
         self._computing.shutdown(cancel_futures=True)
         self._decoding.shutdown(cancel_futures=True)
-        if self.viewer.gallery is not None:
-            self.viewer.gallery.close()
+        if self.studio.gallery is not None:
+            self.studio.gallery.close()
 
     async def about(self, request: Request) -> Response:
         """All that the page needs to draw itself."""
-        examples = [
-            {"name": example.name, "image": data_url(example.thumbnail(THUMBNAIL))}
-            for example in self.viewer.examples
-        ]
-        table = None
-        if (gallery := self.viewer.gallery) is not None:
-            factors = [name for name in gallery.table.factors if name in self.viewer.studio.model.nets]
-            table = {"rows": len(gallery.table), "factors": factors, "note": gallery.without_pictures}
-        return JSONResponse(
-            {
-                "derender": __version__,
-                "body_limit_bytes": BODY_LIMIT_BYTES,
-                "pixel_limit": PIXEL_LIMIT,
-                "examples": examples,
-                "table": table,
-                **self.viewer.studio.about(),
-            }
-        )
+        limits = {"body_limit_bytes": BODY_LIMIT_BYTES, "pixel_limit": PIXEL_LIMIT}
+        return JSONResponse({"derender": __version__, **limits, **self.studio.about()})
 
     async def open_upload(self, request: Request) -> Response:
         """Decompose the image in the body."""
@@ -202,61 +175,39 @@ class Application:
     async def open_example(self, request: Request) -> Response:
         """Decompose one of the examples."""
         number = request.path_params["number"]
-        if not 0 <= number < len(self.viewer.examples):
+        if not 0 <= number < len(self.studio.examples):
             raise Refused(404, f"there is no example {number}")
-        return await self._opened(self.viewer.examples[number].picture)
+        return await self._opened(self.studio.examples[number].picture)
 
     async def open_row(self, request: Request) -> Response:
         """Decompose the image of one row of the table."""
-        gallery = self.viewer.gallery
-        if gallery is None:
-            raise Refused(404, "there is no table: start the viewer with --features FILE.parquet")
-        number = request.path_params["number"]
-        sizes = (LARGEST_SIZE, self.viewer.studio.model.image_size)
+        gallery, number = self.studio.searched(), request.path_params["number"]
+        sizes = (LARGEST_SIZE, self.studio.model.image_size)
         photo, pixels = [await self._work(self._decoding, gallery.picture, number, size) for size in sizes]
         return await self._opened(photo.transpose(1, 2, 0), pixels)
-
-    async def factors(self, request: Request) -> Response:
-        """The maps of an image, by name, as images inside JSON."""
-        question = await self._question(request, ViewRequest)
-        maps = await self._work(self._computing, self.viewer.studio.maps, question)
-        return JSONResponse({name: data_url(image) for name, image in maps.items()})
-
-    async def settings(self, request: Request) -> Response:
-        """Light and camera as JSON."""
-        question = await self._question(request, ViewRequest)
-        text = json.dumps(self.viewer.studio.settings(question), indent=1) + "\n"
-        return Response(text, media_type="application/json")
 
     async def neighbours(self, request: Request) -> Response:
         """The rows nearest to an image by one factor, with their images where those are here."""
         question = await self._question(request, NeighbourRequest)
-        found = await self._work(self._computing, self.viewer.studio.neighbours, question)
-        gallery = self.viewer.gallery
-        assert gallery is not None, "a studio with a table has a gallery"
-        rows = []
-        for row, distance in found:
-            image = await self._work(self._decoding, _thumbnail, gallery, row)
-            rows.append({**gallery.about(row), "distance": distance, "image": image})
+        rows, gallery = [], self.studio.searched()
+        for row, distance in await self._work(self._computing, self.studio.neighbours, question):
+            shown = await self._work(self._decoding, gallery.shown, row)
+            rows.append({**shown, "distance": distance})
         return JSONResponse({"factor": question.factor, "rows": rows})
 
     async def made(
-        self, make: Callable[[Any], bytes], kind: type[Q], request: Request, *, patience: int = 1
+        self, make: Callable[[Any], Any], kind: type[Question], request: Request, *, patience: int = 1
     ) -> Response:
-        """Bytes that the studio makes for a question."""
+        """What the studio makes for a question: the bytes of a file, or values as JSON."""
         question = await self._question(request, kind)
         content = await self._work(self._computing, make, question, patience=patience)
+        if not isinstance(content, bytes):
+            return JSONResponse(content)
         known = (kind for start, kind in MEDIA_TYPES.items() if content.startswith(start))
         return Response(content, media_type=next(known, "video/mp4"))
 
-    async def crop(self, request: Request) -> Response:
-        """Decompose an opened image again."""
-        question = await self._question(request, CropRequest)
-        again = self.viewer.studio.again
-        return JSONResponse(await self._work(self._computing, again, question, patience=LONG_WORK))
-
     async def _opened(self, *images: Any) -> Response:
-        return JSONResponse(await self._work(self._computing, self.viewer.studio.open, *images))
+        return JSONResponse(await self._work(self._computing, self.studio.open, *images))
 
     async def _work(
         self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any, patience: int = 1
@@ -273,7 +224,7 @@ class Application:
         finally:
             self._waiting -= 1
 
-    async def _question(self, request: Request, kind: type[Q]) -> Q:
+    async def _question(self, request: Request, kind: type[Question]) -> Question:
         body = Body()
         await self._receive(request, body, REQUEST_LIMIT_BYTES)
         return read_request(kind, bytes(body.content))
@@ -298,31 +249,13 @@ class Application:
         body.whole = True
 
 
-def _thumbnail(gallery: Gallery, row: int) -> str | None:
-    """A row's image inside JSON, or None where it cannot be shown."""
-    try:
-        return data_url(pictures(gallery.picture(row, THUMBNAIL)[None])[0])
-    except Refused:
-        return None
+async def _page_file(content: bytes, media_type: str, request: Request) -> Response:
+    return Response(content, media_type=media_type)
 
 
-def _page_file(name: str, media_type: str) -> Answer:
-    """An answer that is one of the page's own files, read now."""
-    content = (files("derender.report.viewer") / "page" / name).read_bytes()
-
-    async def answer(request: Request) -> Response:
-        return Response(content, media_type=media_type)
-
-    return answer
-
-
-async def _no_such_address(request: Request, problem: HTTPException) -> Response:
-    return JSONResponse({"error": problem.detail}, problem.status_code, headers=problem.headers)
-
-
-async def _refusal(request: Request, refused: Refused) -> Response:
-    return JSONResponse({"error": refused.message}, refused.status)
-
-
-async def _gone(request: Request, problem: ClientDisconnect) -> Response:
+async def _problem(request: Request, problem: HTTPException | Refused | ClientDisconnect) -> Response:
+    if isinstance(problem, Refused):
+        return JSONResponse({"error": problem.message}, problem.status)
+    if isinstance(problem, HTTPException):  # no such address
+        return JSONResponse({"error": problem.detail}, problem.status_code, headers=problem.headers)
     return Response(status_code=400)

@@ -41,11 +41,13 @@ class Refused(Exception):
         self.message = message
 
 
-class _Checked(BaseModel):
+class Checked(BaseModel):
+    """Values of a request: of the stated types, finite, and no others."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
-class Light(_Checked):
+class Light(Checked):
     """Ambient and diffuse strength, pitch and yaw in degrees (conventions.md)."""
 
     ambient: Strength
@@ -64,7 +66,7 @@ class Light(_Checked):
         return torch.tensor([[self.ambient, self.diffuse, radians(self.pitch_deg), radians(self.yaw_deg)]])
 
 
-class Camera(_Checked):
+class Camera(Checked):
     """Rotation about x, y, z in degrees and translation in scene units (conventions.md)."""
 
     rotation_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)]
@@ -84,7 +86,7 @@ def _degrees(angles: Float[Tensor, " k"]) -> list[float]:
     return [min(max(degrees(one), -STEEPEST_DEG), STEEPEST_DEG) for one in angles.nan_to_num().tolist()]
 
 
-class ViewRequest(_Checked):
+class ViewRequest(Checked):
     """An image as it is to be shown."""
 
     picture: ImageId  # the name it got when it was opened
@@ -106,7 +108,7 @@ class FilmRequest(ViewRequest):
     move: Literal["light", "camera"]
 
 
-class Place(_Checked):
+class Place(Checked):
     """A square in the photograph: its centre and side in pixels, its clockwise turn in degrees."""
 
     x: Annotated[float, Field(ge=0, le=PIXEL_LIMIT)]
@@ -115,7 +117,7 @@ class Place(_Checked):
     roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
 
 
-class CropRequest(_Checked):
+class CropRequest(Checked):
     """An opened image to be decomposed again, with its scene optimised against it or not.
 
     ``crop`` is the part that the model is given, or how it is found; the same as before if left out.
@@ -133,10 +135,10 @@ class NeighbourRequest(ViewRequest):
     k: Annotated[int, Field(ge=1, le=48)] = 12
 
 
-Q = TypeVar("Q", bound=_Checked)
+Question = TypeVar("Question", bound=Checked)
 
 
-def read_request(kind: type[Q], body: bytes) -> Q:
+def read_request(kind: type[Question], body: bytes) -> Question:
     """The question in a request's body; anything else is refused with its first mistake."""
     try:
         return kind.model_validate_json(body)

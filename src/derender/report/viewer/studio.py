@@ -22,7 +22,7 @@ from PIL import Image
 
 from derender import __version__
 from derender.data import as_float
-from derender.features import FeatureTable, named
+from derender.features import named
 from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
 from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
@@ -31,9 +31,10 @@ from derender.photo.faces import frame_of, template_of
 from derender.report import colours
 from derender.report.decomposition import factor_images
 from derender.report.mesh import model_mesh
-from derender.report.page import data_uri, image_bytes
+from derender.report.page import image_bytes
 from derender.report.panel import labelled_grid
 from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
+from derender.report.viewer.images import Example, Gallery, Shelf, ShownImage, data_url
 from derender.report.viewer.questions import (
     Camera,
     CropRequest,
@@ -44,7 +45,6 @@ from derender.report.viewer.questions import (
     Refused,
     ViewRequest,
 )
-from derender.report.viewer.shelf import Shelf, ShownImage
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.training.held_out_errors import (
@@ -57,7 +57,7 @@ from derender.training.held_out_errors import (
 
 PHOTOGRAPHS_KEPT = 6  # ready to be drawn
 LARGEST_PHOTO = 4096
-PREVIEW_SIZE, THUMBNAIL_SIZE, SURFACE_SIZE = 1024, 128, 128
+PREVIEW_SIZE, SURFACE_SIZE = 1024, 128
 FIT_STEPS = 60
 FILM_SIZE, FILM_FRAMES, FILM_SECONDS = 384, 24, 3.0
 FILM_LIGHT_DEG, FILM_VIEW_DEG = 50.0, 20.0
@@ -70,18 +70,25 @@ class Studio:
     model: Derenderer  # in evaluation mode
     name: str  # of the model, on the page
     shelf: Shelf = field(default_factory=Shelf)  # the opened images
+    examples: Sequence[Example] = ()  # images to begin with
+    gallery: Gallery | None = None  # rows to look for neighbours in; None for none
     # reconstruction errors that were stored with the model; None if there are none
     held_out: HeldOutErrors | None = None
-    table: FeatureTable | None = None  # features to look for neighbours in; None for none
     fit_steps: int = 0  # of test-time optimisation of each scene; 0 shows feed-forward scenes
     # how the part of an image is found that the model is given (``photo.found_frame``)
     frame: str | None = None
     _photographs: OrderedDict[tuple[str, int, bool], Photograph] = field(default_factory=OrderedDict)
 
     def about(self) -> dict[str, Any]:
-        """The model's name and abilities, ranges of the camera, and the number of images in memory."""
-        ranges, rows = self.model.settings.ranges, self.model.factors
+        """The model's name and abilities, ranges of the camera, examples, table, bound of the shelf."""
+        ranges, rows, table = self.model.settings.ranges, self.model.factors, None
+        if self.gallery is not None:
+            factors = [name for name in self.gallery.table.factors if name in self.model.nets]
+            note = self.gallery.without_pictures
+            table = {"rows": len(self.gallery.table), "factors": factors, "note": note}
         return {
+            "examples": [{"name": one.name, "image": data_url(one.thumbnail())} for one in self.examples],
+            "table": table,
             "model": self.name,
             "faces": template_of(self.model) is not None,
             "can_fit": self.model.fitting is not None,
@@ -242,6 +249,10 @@ class Studio:
                 **{name: image for name, (image,) in factors.items()},
             }
 
+    def factors(self, question: ViewRequest) -> dict[str, str]:
+        """The same as images inside JSON."""
+        return {name: data_url(image) for name, image in self.maps(question).items()}
+
     def panel(self, question: ViewRequest) -> bytes:
         """All maps and the view with their names in one PNG."""
         columns = self.maps(question) | {"view": self._drawn(question)}
@@ -252,7 +263,7 @@ class Studio:
         files = {f"{name}.png": image_bytes(image) for name, image in self.maps(question).items()}
         files |= {"panel.png": self.panel(question), "view.png": self.picture(question)}
         files["surface.glb"] = self.mesh(question)
-        files["settings.json"] = (json.dumps(self.settings(question), indent=1) + "\n").encode()
+        files["settings.json"] = self.settings_file(question)
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in files.items():
@@ -290,19 +301,28 @@ class Studio:
             "size": self._size(question),
         }
 
+    def settings_file(self, question: ViewRequest) -> bytes:
+        """The same as a file of JSON."""
+        return (json.dumps(self.settings(question), indent=1) + "\n").encode()
+
     def neighbours(self, question: NeighbourRequest) -> list[tuple[int, float]]:
         """Rows nearest by one factor of the image that gives it, and distances; without that image itself."""
-        if self.table is None:
-            raise Refused(404, "there is no table to look in: start the viewer with --features FILE.parquet")
+        table = self.searched().table
         other = dict(question.swaps).get(question.factor, question.picture)  # type: ignore[call-overload]
         features = self.shelf.get(other).features
         try:
             feature = named(features, question.factor, "factor")
-            itself = same_image(self.table, features)
-            rows, away = nearest(self.table, feature, question.factor, question.k, exclude=itself.tolist())
+            itself = same_image(table, features)
+            rows, away = nearest(table, feature, question.factor, question.k, exclude=itself.tolist())
         except ValueError as problem:
             raise Refused(422, str(problem)) from problem
         return list(zip(rows.tolist(), away.tolist(), strict=True))
+
+    def searched(self) -> Gallery:
+        """The rows to look in; ``Refused`` (404) where there are none."""
+        if self.gallery is None:
+            raise Refused(404, "there is no table: start the viewer with --features FILE.parquet")
+        return self.gallery
 
     def _size(self, question: ViewRequest) -> int:
         return max(question.size or 0, self.model.image_size)
@@ -360,8 +380,3 @@ def _encoded(image: Image.Image) -> bytes:
     if image.mode != "RGB":
         return image_bytes(image, compress_level=1)
     return image_bytes(image, "JPEG", quality=92)
-
-
-def data_url(image: Image.Image) -> str:
-    """An image that travels inside JSON."""
-    return data_uri(image_bytes(image, compress_level=1))

@@ -1,13 +1,17 @@
-"""Images that the page offers: examples to begin with, and rows of a feature table by number.
+"""Images of the page: opened ones, examples to begin with, and rows of a feature table by number.
 
-Examples lie beside this file, eight in a row. portraits.webp, for ``faces-64``: heads that
-``derender.data.synthetic`` made (seed 7). faces.png, for ``rendered-faces-64``: eight of the 800 images that
-it was tested on, evenly spaced; cars.png: eight of the 1,000 that ``cars-64`` was tested on, evenly by class
-(Kenney and Quaternius, CC0). Heads: geometry ICT-FaceKit, MIT; skins MakeHuman, CC0. They show no real person
-and no model saw them in training. Rows of a table are read from folders, zips and tables of paths in place. A
-stream (tar shards, Hugging Face) is read only from its beginning, so its images are not shown.
+Opened images are kept in memory only: a bounded number of them, and of bytes. Examples lie beside this file,
+eight in a row. portraits.webp, for ``faces-64``: heads that ``derender.data.synthetic`` made (seed 7).
+faces.png, for ``rendered-faces-64``: eight of the 800 images that it was tested on, evenly spaced; cars.png:
+eight of the 1,000 that ``cars-64`` was tested on, evenly by class (Kenney and Quaternius, CC0). Heads:
+geometry ICT-FaceKit, MIT; skins MakeHuman, CC0. They show no real person and no model saw them in training.
+Rows of a table are read from folders, zips and tables of paths in place. A stream (tar shards, Hugging Face)
+is read only from its beginning, so its images are not shown.
 """
 
+import secrets
+import threading
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -21,14 +25,76 @@ from PIL import Image, ImageOps
 
 from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
+from derender.photo import Frame
+from derender.report.colours import pictures
+from derender.report.page import data_uri, image_bytes
 from derender.report.viewer.questions import Refused, pixels_of
+from derender.scene import Scene
 
+KEPT = 64
+KEPT_BYTES = 400_000_000
+"""Of photographs together."""
 ROWS = {
     **dict.fromkeys(("faces-64", "faces-128"), "portraits.webp"),
     "rendered-faces-64": "faces.png",
     "cars-64": "cars.png",
 }
-LABELS_SHOWN = 4
+LABELS_SHOWN, THUMBNAIL = 4, 96
+
+
+@dataclass(frozen=True)
+class ShownImage:
+    """One opened image."""
+
+    photo: UInt8[np.ndarray, "h w 3"]  # the photograph, its longer side at most ``studio.LARGEST_PHOTO``
+    faces: tuple[Frame, ...]  # the frames of the faces found in it
+    frame: Frame  # the part that the model was given
+    framed: str  # how that was found: "face", "auto", "none", "no face" or "own"
+    pixels: UInt8[np.ndarray, "3 s s"]  # that part at the model's size
+    scene: Scene  # one scene, on the CPU
+    features: Mapping[str, np.ndarray]  # by factor, (D,) each
+
+
+class Shelf:
+    """Opened images by names that cannot be guessed: at most ``limit``, and ``limit_bytes`` of photographs.
+
+    When it is full, the image leaves that was not requested for longest; the last two stay. Safe to use from
+    several threads.
+    """
+
+    def __init__(self, limit: int = KEPT, limit_bytes: int = KEPT_BYTES):
+        if limit < 2:
+            raise ValueError(f"a shelf needs room for 2 images or more, for swaps; got {limit}")
+        self.limit, self.limit_bytes = limit, limit_bytes
+        self._images: OrderedDict[str, ShownImage] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def put(self, image: ShownImage) -> str:
+        """Store an image; returns its name."""
+        name = secrets.token_urlsafe(16)
+        with self._lock:
+            self._images[name] = image
+            while len(self._images) > self.limit or (
+                len(self._images) > 2 and self._kept_bytes() > self.limit_bytes
+            ):
+                self._images.popitem(last=False)
+        return name
+
+    def _kept_bytes(self) -> int:
+        return sum({id(image.photo): image.photo.nbytes for image in self._images.values()}.values())
+
+    def get(self, name: str) -> ShownImage:
+        """The image of that name, which now counts as used; ``Refused`` (410) if it has left."""
+        with self._lock:
+            if name not in self._images:
+                raise Refused(
+                    410, f"this image is no longer stored (the last {self.limit} are): open it again"
+                )
+            self._images.move_to_end(name)
+            return self._images[name]
 
 
 @dataclass(frozen=True)
@@ -38,14 +104,9 @@ class Example:
     name: str
     picture: UInt8[np.ndarray, "h w 3"]
 
-    def thumbnail(self, size: int) -> Image.Image:
+    def thumbnail(self, size: int = THUMBNAIL) -> Image.Image:
         """Its middle square."""
         return ImageOps.fit(Image.fromarray(self.picture), (size, size))
-
-
-def named_examples(images: Mapping[Path, np.ndarray]) -> list[Example]:
-    """Images by file name."""
-    return [Example(path.name, pixels) for path, pixels in images.items()]
 
 
 def rendered_examples(model: str, image_size: int | None = None) -> list[Example]:
@@ -85,11 +146,15 @@ class Gallery:
         if source is not None and not any(file in self._position for file in table.files):
             raise ValueError(f"{source} holds none of the table's images, such as {table.files[0]!r}")
 
-    def about(self, row: int) -> dict[str, Any]:
-        """Name and labels of a row, as text."""
+    def shown(self, row: int) -> dict[str, Any]:
+        """A row as JSON has it: its name, labels and image; None for an image that cannot be shown."""
         labels = [name for name in self.table.labels if name != "partition"][:LABELS_SHOWN]
-        shown = {name: str(self.table.labels[name][row]) for name in labels}
-        return {"row": row, "file": self.table.files[row], "labels": shown}
+        named = {name: str(self.table.labels[name][row]) for name in labels}
+        try:
+            image = data_url(pictures(self.picture(row, THUMBNAIL)[None])[0])
+        except Refused:
+            image = None
+        return {"row": row, "file": self.table.files[row], "labels": named, "image": image}
 
     def picture(self, row: int, size: int) -> UInt8[np.ndarray, "3 s s"]:
         """The image of a row; ``Refused`` (404, 413, 415) where it cannot be shown."""
@@ -121,3 +186,8 @@ def _listed(place: str, dataset: str) -> ListedStream:
         return stream
     stream.close()
     raise ValueError(f"{place} can only be read from its beginning: images of rows are not shown")
+
+
+def data_url(image: Image.Image) -> str:
+    """An image that travels inside JSON."""
+    return data_uri(image_bytes(image, compress_level=1))
