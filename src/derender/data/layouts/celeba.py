@@ -77,11 +77,7 @@ class _OwnersList(NamedTuple):
 def _owners_list(
     source: Source, stem: str, codes: Sequence[str] = (), meaning: str = ""
 ) -> _OwnersList | None:
-    """The list of that name, as the original text or as a CSV copy, or None when neither is there.
-
-    Errors are a row of another length, a value outside ``codes``, and a list with fewer rows than its first
-    line says.
-    """
+    """The list of that name, as the original text or as a CSV copy, or None when neither is there."""
     file = source.named(f"{stem}.txt", f"{stem}.csv")
     if file is None:
         return None

@@ -53,24 +53,17 @@ class FaceGrid:
 
 @dataclass(frozen=True)
 class FaceShape:
-    """A linear family of surfaces (rows, columns, 3) in face pixels.
-
-    Attributes:
-        grid, triangles: the domain, and the mesh of its vertices row by row.
-        outward: unit vectors out of the bare head, level below the ears, where hair hangs.
-        names, modes: one displacement per trait of shape.
-        actions: the left and the right half of each of ``ACTIONS``: displacement, and the rows and columns
-            that it moves.
-    """
+    """A linear family of surfaces (rows, columns, 3) in face pixels."""
 
     grid: FaceGrid
-    triangles: Int32[ndarray, "f 3"]
+    triangles: Int32[ndarray, "f 3"]  # of the grid's vertices row by row
     mean: Float[ndarray, "rows columns 3"]  # the mean head without ears; symmetric
     ear: Float[ndarray, "rows columns 3"]  # displacement by ears, kept apart because hair may cover them
-    outward: Float[ndarray, "rows columns 3"]
+    outward: Float[ndarray, "rows columns 3"]  # out of the bare head, level below the ears, where hair hangs
     reach: Float[ndarray, "rows 1"]  # half width of the bare head
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the modes: one displacement per trait of shape
     modes: Float[ndarray, "modes rows columns 3"]
+    # left and right half of each of ``ACTIONS``: displacement, and the rows and columns that it moves
     actions: list[tuple[ndarray, tuple[slice, slice]]]
 
 

@@ -37,40 +37,23 @@ _NOISE_CELLS = 5
 
 @dataclass(frozen=True)
 class SyntheticSet:
-    """N square images of size S with exact truth, one sample at each pixel's centre.
+    """N square images of size S with exact truth, one sample at each pixel's centre; maps are 0 on the
+    background."""
 
-    Attributes:
-        images: shaded images over a background.
-        depth: z in camera space, 0 on the background.
-        normal: inward unit normals in the camera frame, 0 on the background.
-        albedo: reflectance as seen by the camera, 0 on the background.
-        mask: where the object is.
-        parts: which part of the object is seen, a number into ``part_names``; 0 on the background.
-        light: ambient, diffuse, pitch, yaw (radians, canonical frame).
-        camera: rotation x, y, z (radians, about (0, 0, 1)), translation x, y, z.
-        identity: number of the person or model.
-        labels: what else is known of each image, by column name (expression, age, ...): text or numbers.
-        identity_traits: the traits drawn for each image's identity, by name.
-        part_names: names of the parts, background first.
-        fov_deg: field of view of every image.
-        effects: with effects, further maps by name, 0 on the background: ``shading`` (all diffuse light),
-            ``visible`` (share of the first lamp's light that arrives), ``highlight`` and ``transmission``.
-    """
-
-    images: UInt8[ndarray, "n 3 s s"]
-    depth: Float32[ndarray, "n s s"]
-    normal: Float32[ndarray, "n s s 3"]
-    albedo: UInt8[ndarray, "n 3 s s"]
-    mask: Bool[ndarray, "n s s"]
-    parts: UInt8[ndarray, "n s s"]
-    light: Float32[ndarray, "n 4"]
-    camera: Float32[ndarray, "n 6"]
-    identity: Int64[ndarray, "n"]
-    labels: Mapping[str, Shaped[ndarray, "n"]]
-    identity_traits: Mapping[str, Shaped[ndarray, "n"]]
-    part_names: tuple[str, ...]
-    fov_deg: float = FOV_DEG
-    effects: Mapping[str, Float32[ndarray, "n s s"]] = field(default_factory=dict)
+    images: UInt8[ndarray, "n 3 s s"]  # shaded, over a background
+    depth: Float32[ndarray, "n s s"]  # z in camera space
+    normal: Float32[ndarray, "n s s 3"]  # inward unit normals in the camera frame
+    albedo: UInt8[ndarray, "n 3 s s"]  # reflectance as seen by the camera
+    mask: Bool[ndarray, "n s s"]  # where the object is
+    parts: UInt8[ndarray, "n s s"]  # which part of the object is seen, a number into ``part_names``
+    light: Float32[ndarray, "n 4"]  # ambient, diffuse, pitch, yaw (radians, canonical frame)
+    camera: Float32[ndarray, "n 6"]  # rotation x, y, z (radians, about (0, 0, 1)), translation x, y, z
+    identity: Int64[ndarray, "n"]  # number of the person or model
+    labels: Mapping[str, Shaped[ndarray, "n"]]  # expression, age, ... of each image: text or numbers
+    identity_traits: Mapping[str, Shaped[ndarray, "n"]]  # drawn for each image's identity
+    part_names: tuple[str, ...]  # background first
+    fov_deg: float = FOV_DEG  # field of view of every image
+    effects: Mapping[str, Float32[ndarray, "n s s"]] = field(default_factory=dict)  # maps of ``EFFECTS``
 
     def __len__(self) -> int:
         return len(self.images)
@@ -113,8 +96,7 @@ def make_set(
     progress: Progress | None,
     effects: EffectSettings,
 ) -> SyntheticSet:
-    """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are those of images of one
-    object.
+    """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are some of one object.
 
     Raises:
         ValueError: a number that no set can have.
