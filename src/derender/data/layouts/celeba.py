@@ -44,10 +44,9 @@ BOX_LIST = "boxes.csv"
 _PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
 _IN_ORDER = np.array(["", *_PARTITIONS.values()])  # the parts are runs of image numbers, from these on
 _FIRST_NUMBERS = (1, 162_771, 182_638)
-_EYES_AND_MOUTH = (
-    *("lefteye_x", "lefteye_y", "righteye_x", "righteye_y"),
-    *("leftmouth_x", "leftmouth_y", "rightmouth_x", "rightmouth_y"),
-)
+_EYES_AND_MOUTH = [
+    f"{side}{part}_{axis}" for part in ("eye", "mouth") for side in ("left", "right") for axis in "xy"
+]
 _SIZED, _SIDES = ("left", "top", "width", "height"), ("left", "top", "right", "bottom")
 _MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 

@@ -193,11 +193,30 @@ def write(
     require_empty(folder := Path(folder))
     files, maps = [f"images/{i:06d}.jpg" for i in range(len(synthetic))], (*_MAPS, *synthetic.effects)
     if "track" in synthetic.labels:
-        numbers = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
-        files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in numbers]
+        shown = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
+        files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in shown]
         truth = False
     with atomic_folder(folder) as temporary:
-        _fill(temporary, synthetic, files, maps if truth else (), progress)
+        for parent in {Path(file).parent for file in files} | set(map(Path, maps if truth else ())):
+            (temporary / parent).mkdir(parents=True, exist_ok=True)
+
+        def save(i: int) -> None:
+            picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
+            picture.save(temporary / files[i], quality=92, subsampling=0)
+            for name, pixels in _encoded(synthetic, i).items() if truth else ():
+                Image.fromarray(pixels).save(temporary / name / f"{i:06d}.png", compress_level=1)
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            for done, _ in enumerate(pool.map(save, range(len(files))), 1):
+                if progress is not None:
+                    progress(done, len(files))
+        if truth:
+            names = "\n".join(synthetic.part_names)
+            (temporary / "classes.txt").write_text(names + "\n", encoding="utf-8")
+        numbers, rows = np.unique(synthetic.identity, return_index=True)
+        traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
+        _write_table(temporary / "params.csv", {"file": files, **_parameters(synthetic)})
+        _write_table(temporary / "identities.csv", {"identity": _texts(numbers), **traits})
     return folder
 
 
@@ -205,30 +224,6 @@ def require_empty(folder: Path) -> None:
     """Raise FileExistsError unless the folder is empty or missing."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is not empty: choose another folder")
-
-
-def _fill(
-    folder: Path, synthetic: SyntheticSet, files: list[str], maps: tuple[str, ...], progress: Progress | None
-) -> None:
-    for parent in {(folder / file).parent for file in files} | {folder / name for name in maps}:
-        parent.mkdir(parents=True, exist_ok=True)
-
-    def save(i: int) -> None:
-        picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
-        picture.save(folder / files[i], quality=92, subsampling=0)
-        for name, pixels in _encoded(synthetic, i).items() if maps else ():
-            Image.fromarray(pixels).save(folder / name / f"{i:06d}.png", compress_level=1)
-
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for done, _ in enumerate(pool.map(save, range(len(files))), 1):
-            if progress is not None:
-                progress(done, len(files))
-    if maps:
-        (folder / "classes.txt").write_text("\n".join(synthetic.part_names) + "\n", encoding="utf-8")
-    numbers, rows = np.unique(synthetic.identity, return_index=True)
-    traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
-    _write_table(folder / "params.csv", {"file": files, **_parameters(synthetic)})
-    _write_table(folder / "identities.csv", {"identity": _texts(numbers), **traits})
 
 
 def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
