@@ -63,6 +63,11 @@ def grid_triangles(rows: int, columns: int, mirrored: float = 0.0) -> Int32[ndar
     return np.stack([*first, *second], axis=-1).reshape(-1, 3).astype(np.int32)
 
 
+def unit(vectors: ndarray) -> ndarray:
+    """The vectors along the last axis at length 1; 0 stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
 @kernel
 @no_type_check
 def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
