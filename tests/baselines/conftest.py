@@ -6,8 +6,41 @@ import numpy as np
 import pytest
 import torch
 
+from derender.baselines import baseline_config, train_baseline
 from derender.baselines.model import LossInputs
 from derender.data import ImageSet
+from derender.report.run import baseline_sheet
+
+COMMON = ["image_size=32", "batch_size=8", "checkpoint_every=24", "validate_every=24", "sample_every=48"]
+OWN = {
+    **{name: ["width=8", "code_size=16"] for name in ("simclr", "ae", "beta-vae")},
+    "vqvae": ["width=8", "codes=8"],
+    "stylegan2": [
+        *("style_size=6", "mapping_layers=2", "channel_base=64", "channel_max=6"),
+        *("r1_every=3", "path_every=2"),  # in both halves of a run of six steps
+    ],
+    "e4e": ["width=4", "units=[1,1,1,1]", "self_features_steps=2", "first_release=8"],
+}
+
+
+def config(name: str, images: int, *more: str):
+    return baseline_config(name, [*COMMON, *OWN[name], "deterministic=true", f"images={images}", *more])
+
+
+def generator_of(name: str, folder) -> list[str]:
+    """The setting that names the generator which e4e inverts."""
+    return [f"generator={folder / 'stylegan2'}"] if name == "e4e" else []
+
+
+@pytest.fixture(scope="session")
+def runs(blobs, tmp_path_factory):
+    """One finished run of each, by name."""
+    folder = tmp_path_factory.mktemp("runs")
+    for name in OWN:
+        own = config(name, 48, *generator_of(name, folder))
+        train_baseline(own, blobs, folder / name, sample_sheet=baseline_sheet)
+    torch.use_deterministic_algorithms(False)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -8,33 +8,16 @@ import pytest
 import torch
 from PIL import Image
 from safetensors.torch import load_file, save_file
+from tests.baselines.conftest import OWN, config, generator_of
 
 import derender
-from derender.baselines import baseline_config, load_baseline, network_type, read_any_config, train_baseline
+from derender.baselines import load_baseline, network_type, read_any_config, train_baseline
 from derender.features import embed_image_set
 from derender.report.run import baseline_sheet, run_page
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import config_from_tree
 from derender.training.run_folder import read_config, read_metrics
-
-COMMON = ["image_size=32", "width=8", "batch_size=8", "checkpoint_every=24", "validate_every=24"]
-COMMON += ["sample_every=48", "deterministic=true"]
-OWN = {"vqvae": ["codes=8"], "simclr": ["code_size=16"], "ae": ["code_size=16"], "beta-vae": ["code_size=16"]}
-
-
-def config(name: str, images: int, *more: str):
-    return baseline_config(name, [*COMMON, *OWN[name], f"images={images}", *more])
-
-
-@pytest.fixture(scope="module")
-def runs(blobs, tmp_path_factory):
-    """One finished run of each, by name; generators have tests of their own."""
-    folder = tmp_path_factory.mktemp("runs")
-    for name in OWN:
-        train_baseline(config(name, 48), blobs, folder / name, sample_sheet=baseline_sheet)
-    torch.use_deterministic_algorithms(False)
-    return folder
 
 
 @pytest.fixture
@@ -49,12 +32,13 @@ def weights(run, which: str = "last") -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("name", OWN)
 def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, runs, blobs, tmp_path):
-    run = runs / name
-    assert read_any_config(run) == config(name, 48)
+    run, generator = runs / name, generator_of(name, runs)
+    assert read_any_config(run) == config(name, 48, *generator)
     assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "previous", "best"}
     assert [row["kind"] for row in read_metrics(run)] == ["train", "validation", "validation"]
     with Image.open(run / "samples" / "000000048.png") as sheet:
-        assert sheet.width > (5 if name == "simclr" else 2) * 160 and np.asarray(sheet).std() > 20
+        columns = {"simclr": 5, "stylegan2": 7}.get(name, 2)
+        assert sheet.width > columns * 160 and np.asarray(sheet).std() > 20
     assert f"Baseline {name}, seed 0." in run_page(run).html()
 
     model = load_baseline(run)
@@ -66,12 +50,12 @@ def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, ru
     best = weights(run, "best")
     assert all(torch.equal(value, best[key]) for key, value in model.state_dict().items())
 
-    train_baseline(config(name, 24), blobs, tmp_path / "parts")
-    train_baseline(config(name, 48), blobs, tmp_path / "parts", resume=True)
+    train_baseline(config(name, 24, *generator), blobs, tmp_path / "parts")
+    train_baseline(config(name, 48, *generator), blobs, tmp_path / "parts", resume=True)
     whole, parts = weights(run), weights(tmp_path / "parts")
     assert whole.keys() == parts.keys() and all(torch.equal(whole[key], parts[key]) for key in whole)
     with pytest.raises(ValueError, match="was trained with another seed"):
-        train_baseline(config(name, 72, "seed=3"), blobs, tmp_path / "parts", resume=True)
+        train_baseline(config(name, 72, "seed=3", *generator), blobs, tmp_path / "parts", resume=True)
 
 
 def test_physical_views_train_and_the_renderer_stays_out_of_the_checkpoint(blobs, tmp_path):

@@ -68,7 +68,7 @@ def test_ward_holds_no_square_of_the_rows():
 
 
 def test_nearest_rows_are_those_of_all_distances(monkeypatch):
-    monkeypatch.setattr(neighbours, "TILE", 16)
+    monkeypatch.setattr(neighbours, "NUMBERS_AT_ONCE", 16 * 53)
     features = groups(53, 3)
     features[5] = 0
     distances = pairwise_distances(features, metric="cosine")

@@ -150,20 +150,18 @@ def test_labels_beyond_those_asked_for_and_those_tested_stay_hidden(pictures):
 
 
 def test_the_loss_of_a_head_is_torchs_cross_entropy_over_what_is_known():
-    def target_loss(logits, targets, kind):
-        return head_loss(logits[None], targets[None], kind)[0]
-
-    torch.manual_seed(0)
-    logits, classes = torch.randn(6, 3), torch.tensor([0, 1, 2, 2, 1, 0])
-    targets = one_hot(classes, 3).float()
-    targets[4:] = -1
-    expected = cross_entropy(logits[:4], classes[:4])
-    assert target_loss(logits, targets, "classes") == pytest.approx(expected.item())
+    logits, classes = torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), torch.arange(6) % 3
+    one_of = one_hot(classes, 3).float()
+    one_of[4:] = -1
     yes_no = torch.tensor([[1.0, -1], [0, 1], [-1, -1]])
-    expected = binary_cross_entropy_with_logits(logits[[0, 1, 1], [0, 0, 1]], torch.tensor([1.0, 0, 1]))
-    assert target_loss(logits[:3, :2], yes_no, "labels") == pytest.approx(expected.item())
-    for kind in ("classes", "labels"):
-        assert target_loss(logits, torch.full((6, 3), -1.0), kind) == 0
+    known = logits[[0, 1, 1], [0, 0, 1]], torch.tensor([1.0, 0, 1])
+    for kind, shown, targets, expected in (
+        ("classes", logits, one_of, cross_entropy(logits[:4], classes[:4])),
+        ("labels", logits[:3, :2], yes_no, binary_cross_entropy_with_logits(*known)),
+        ("classes", logits, torch.full((6, 3), -1.0), torch.tensor(0.0)),
+        ("labels", logits, torch.full((6, 3), -1.0), torch.tensor(0.0)),
+    ):
+        assert head_loss(shown[None], targets[None], kind)[0] == pytest.approx(expected.item())
 
 
 def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):

@@ -166,18 +166,3 @@ def test_known_maps(model, images):
     assert divmod(int(attribution.upsampled(corner, 32)[0].argmax()), 32) == (0, 28)
     maps = saliency("grad-cam", model, images, "light")
     assert maps.shape == (3, 4, 4) and bool((maps >= 0).all()) and float(maps.max()) > 0
-
-
-@pytest.mark.parametrize(
-    ("method", "factor", "targets", "message"),
-    [
-        ("gradcam", "geometry", [0, 0, 0], "did you mean 'grad-cam'"),
-        ("grad-cam", "shape", [0, 0, 0], "unknown factor of the probe 'shape'"),
-        ("grad-cam", "geometry", [0], "3 images need as many targets, got 1"),
-    ],
-)
-def test_bad_words(model, probe, images, method, factor, targets, message):
-    with pytest.raises(ValueError, match=message):
-        saliency(method, model, images, factor, probe, targets)
-    with pytest.raises(ValueError, match="2 images or more, got 1"):
-        sanity_check(model, probe, probe, images[:1], np.zeros(1, np.int64))

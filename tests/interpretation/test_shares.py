@@ -71,8 +71,6 @@ def test_one_used_factor_has_everything_and_symmetric_factors_equal_shares(z, we
 def test_bad_words(z, weight, monkeypatch):
     with pytest.raises(ValueError, match="did you mean 'logit'"):
         integrated_gradients(probe_of(weight), z, 0, output="logits")
-    with pytest.raises(ValueError, match=r"takes features \(N, 12\), got \(30, 3\)"):
-        integrated_gradients(probe_of(weight), z[:, :3], 0)
 
     def missing(name, *rest):
         raise ImportError(f"No module named {name!r}")

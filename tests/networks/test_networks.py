@@ -1,12 +1,14 @@
-"""Networks: the paper's parameter counts, every image size, bounded outputs."""
+"""Networks: the paper's parameter counts, every image size, bounded outputs; layers that do less work."""
 
 import pytest
 import torch
+from tests.tolerances import assert_agrees
+from torch.nn import functional
 
 from derender.model import Derenderer
 from derender.networks import FACTORS, NetworkSettings
-from derender.networks.decoders import ConfidenceNet
-from derender.networks.encoders import IMAGE_SIZES, UNetEncoder
+from derender.networks.decoders import ConfidenceNet, NarrowConv2d, UpsampledConv2d
+from derender.networks.encoders import IMAGE_SIZES, NormReLU, UNetEncoder
 
 PAPER_PARAMETERS = {"geometry": 12_979_648, "albedo": 12_982_848, "confidence": 7_678_208}
 PAPER_PARAMETERS |= {"light": 1_739_264, "camera": 1_739_776}
@@ -77,3 +79,56 @@ def test_confidence_is_positive():
 def test_an_impossible_picture_size_is_named(size):
     with pytest.raises(ValueError, match="image_size must be one of 32, 64, 128, 256"):
         NetworkSettings(image_size=size)
+
+
+DTYPES = (torch.float32, torch.float64)
+
+
+def gradients(output, inputs, generator):
+    cotangent = torch.randn(output.shape, generator=generator, dtype=output.dtype)
+    return torch.autograd.grad(output, inputs, cotangent)
+
+
+def leaf(shape, generator, dtype, *, channels_last=True):
+    value = torch.randn(shape, generator=generator, dtype=dtype)
+    if len(shape) == 4 and channels_last:
+        value = value.contiguous(memory_format=torch.channels_last)
+    return value.requires_grad_()
+
+
+def assert_same(actual, expected, inputs, generator):
+    """Outputs, and the gradient of every input."""
+    assert_agrees(actual, expected)
+    seed = generator.get_state()
+    found = gradients(actual, inputs, generator)
+    wanted = gradients(expected, inputs, generator.set_state(seed))
+    for index, (a, b) in enumerate(zip(found, wanted, strict=True)):
+        assert_agrees(a, b, f"gradient of input {index}")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("height", "width"), [(4, 4), (5, 3), (1, 7)])
+def test_one_transposed_convolution_is_doubling_then_convolution(height, width, dtype, generator):
+    layer = UpsampledConv2d(3, 5).to(dtype)
+    values = leaf((2, 3, height, width), generator, dtype)
+    expected = functional.conv2d(functional.interpolate(values, scale_factor=2), layer.weight, padding=1)
+    assert_same(layer(values), expected, (values, layer.weight), generator)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("channels", [1, 2, 3])
+@pytest.mark.parametrize(("height", "width"), [(4, 8), (16, 12)])
+def test_convolution_by_blocks_is_the_plain_convolution(height, width, channels, dtype, generator):
+    layer = NarrowConv2d(6, channels).to(dtype)
+    values = leaf((2, 6, height, width), generator, dtype)
+    expected = functional.conv2d(values, layer.weight, padding=2)
+    assert_same(layer(values), expected, (values, layer.weight), generator)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_normalisation_is_of_four_channels_a_group_and_then_rectified(slope, generator):
+    values = leaf((2, 8, 5, 7), generator, torch.float64)
+    groups = values.reshape(2, 2, -1)
+    deviation, mean = torch.var_mean(groups, dim=2, correction=0, keepdim=True)
+    expected = functional.leaky_relu((groups - mean) / (deviation + 1e-5).sqrt(), slope)
+    assert_agrees(NormReLU(8, slope).double()(values), expected.reshape(2, 8, 5, 7))

@@ -40,7 +40,7 @@ def test_the_sanity_table_names_what_not_to_trust():
 
 
 def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():
-    svg, png = side_by_side({"light": lambda axes: axes.barh([0], [0.5])}, "share", (3, 2))
+    svg, png = side_by_side({"light": 0.5}, lambda axes, width: axes.barh([0], [width]), "share", (3, 2))
     with Image.open(BytesIO(png)) as picture:
         corner, alpha = picture.convert("RGBA").getpixel((1, 1)), picture.convert("RGBA").getchannel("A")
     assert corner == (255, 255, 255, 255) and alpha.getextrema() == (255, 255)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from derender.networks.factors import camera_from_raw
-from derender.render.renderer import render_scene
+from derender.render import render_scene
 from derender.scene import Scene
 from derender.scene.crop import CropSettings, crop_images, crop_scene, random_crops, ranges_for_crops
 from derender.scene.ranges import SceneRanges

@@ -53,34 +53,28 @@ def test_a_reader_gives_the_same_batches_in_any_order():
     reader.close()
 
 
-class SlowDisk(Batches):
-    """Reading takes five seconds of a clock that nothing else moves; in a thread it takes none."""
-
-    def read(self, position, *ranks):
-        if threading.current_thread() is threading.main_thread():
-            CLOCK[0] += 5
-        elif position == 3:  # read ahead, and still not there when it is asked for
-            ASKED.wait(10)
-            CLOCK[0] += 2
-        return super().read(position, *ranks)
-
-
-CLOCK, ASKED = [0.0], threading.Event()
-
-
 def test_waiting_is_what_was_not_read_ahead(monkeypatch):
-    read_ahead = threading.Event()
+    """Reading takes five seconds of a clock that nothing else moves; in a thread none, for the fourth two."""
+    clock, asked, waited, read = [0.0], threading.Event(), [], Batches.read
 
-    def clock() -> float:
-        if read_ahead.is_set():
-            ASKED.set()
-        return CLOCK[0]
+    def slow(batches, position, *ranks):
+        if threading.current_thread() is threading.main_thread():
+            clock[0] += 5
+        elif position == 3:  # read ahead, and still not there when it is asked for
+            asked.wait(10)
+            clock[0] += 2
+        return read(batches, position, *ranks)
 
-    monkeypatch.setattr(batches_module.time, "perf_counter", clock)
-    reader, waited = Reader(SlowDisk(numbered(12), 4, 3, False)), []
+    def now() -> float:
+        found = clock[0]
+        if len(waited) == 3:
+            asked.set()
+        return found
+
+    monkeypatch.setattr(Batches, "read", slow)
+    monkeypatch.setattr(batches_module.time, "perf_counter", now)
+    reader = Reader(Batches(numbered(12), 4, 3, False))
     for position in (0, 1, 2, 3, 9):
-        if position == 3:
-            read_ahead.set()
         reader.at(position)
         waited.append(reader.waited_s)
     reader.close()

@@ -1,4 +1,4 @@
-"""Errors of held-out images: measured as the evaluation measures them, kept with the model, read back."""
+"""Errors of held-out images: measured as by the evaluation, kept with the model; other things than faces."""
 
 import json
 from types import SimpleNamespace
@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+import derender
 from derender import Derenderer
+from derender.data import read_images
+from derender.data.synthetic import faces
 from derender.evaluation import reconstruction_scores
+from derender.storage.places import model_folder
 from derender.training import held_out_errors as kept
 from derender.training.held_out_errors import HeldOutErrors, errors_of, read_errors, reconstruction_errors
 
@@ -72,3 +76,21 @@ def test_a_damaged_file_says_how_to_make_it_again(tmp_path, damage):
     file.write_text(json.dumps(values | changed[damage]) if damage in changed else damage)
     with pytest.raises(ValueError, match="evaluate reconstruction --store"):
         read_errors(tmp_path)
+
+
+def test_known_percentiles():
+    held_out = kept.HeldOutErrors(pictures=101, quantiles=list(np.linspace(0.1, 0.2, 101)))
+    found = kept.percentile_of(np.array([0.0, 0.1, 0.15, 0.1985, 0.2, 9.0, np.inf]), held_out)
+    assert found == pytest.approx([0, 0, 50, 98.5, 100, 100, 100])
+
+
+def test_rendered_faces_are_known_to_the_bundled_model_and_cars_are_not(shared_data):
+    net = derender.load("rendered-faces-64")
+    held_out = kept.read_errors(model_folder("rendered-faces-64"))
+    assert held_out is not None
+    morphable = read_images(f"{shared_data('data/synface64.zip')}::test_gt", 64, limit=48).images
+    heads = np.concatenate([morphable, faces.generate(48, seed=3).images])  # both families of its training
+    cars = read_images(str(shared_data("data/syncar64.zip")), 64, limit=24).images
+    assert np.median(kept.reconstruction_percentile(net, heads, held_out)) == pytest.approx(50, abs=20)
+    assert (kept.reconstruction_percentile(net, cars, held_out) > kept.OUTLIER_PERCENTILE).all()
+    assert kept.errors_of(net, heads).quantiles[50] == pytest.approx(held_out.quantiles[50], rel=0.15)

@@ -1,12 +1,19 @@
-"""The process of a run: torch's switch goes back; freed memory is reused."""
+"""The process of a run: one at a time writes it; torch's switch goes back; freed memory is reused."""
 
+import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 import torch
+from PIL import Image
 
-from derender.training.process import deterministic_algorithms
+from derender.data import read_images
+from derender.training import resolve, train
+from derender.training.process import LOCK_FILE, deterministic_algorithms, locked
 
 
 @pytest.mark.parametrize("before", [False, True])
@@ -55,3 +62,96 @@ assert open_fabric("cpu").world_size == 1 and "torchmetrics" in sys.modules
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 0, ended.stderr
+
+
+HOLDS = """
+import sys, time
+from pathlib import Path
+from derender.training.process import locked
+with locked(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def other(tmp_path):
+    """A process that writes the run."""
+    process = subprocess.Popen([sys.executable, "-c", HOLDS, str(tmp_path / "run")], stdout=subprocess.PIPE)
+    assert process.stdout is not None and process.stdout.readline() == b"locked\n"
+    yield process
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_second_process_is_told_who_writes_and_a_killed_one_is_taken_over(other, tmp_path):
+    run = tmp_path / "run"
+    with pytest.raises(ValueError, match=f"run is being written by process {other.pid} on .*: wait for it"):
+        locked(run).__enter__()
+    other.send_signal(signal.SIGKILL)
+    other.wait()
+    assert (run / LOCK_FILE).exists()
+    with locked(run):
+        assert f'"pid":{os.getpid()}' in (run / LOCK_FILE).read_text()
+    assert not list(run.iterdir())
+
+
+def test_a_lock_of_another_host_is_named_and_left_alone(tmp_path):
+    (tmp_path / LOCK_FILE).write_text('{"pid": 7, "host": "node-12"}')
+    with pytest.raises(ValueError, match=r"process 7 on node-12: .*if that has ended, delete .*run\.lock"):
+        locked(tmp_path).__enter__()
+    assert "node-12" in (tmp_path / LOCK_FILE).read_text()
+
+
+@pytest.mark.parametrize("content", ["", "[" * 100_000, '{"pid": Infinity}'])
+def test_what_is_no_owner_is_taken_over(tmp_path, content):
+    (tmp_path / LOCK_FILE).write_text(content)
+    (tmp_path / "config.yaml").touch()
+    with locked(tmp_path), locked(tmp_path):
+        assert (tmp_path / LOCK_FILE).exists()
+    assert [file.name for file in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_a_lock_that_is_a_link_or_a_pipe_is_refused(tmp_path):
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / LOCK_FILE).symlink_to(tmp_path / "precious")
+    with pytest.raises(OSError, match=LOCK_FILE):
+        locked(tmp_path).__enter__()
+    (tmp_path / LOCK_FILE).unlink()
+    os.mkfifo(tmp_path / LOCK_FILE)
+    with pytest.raises(ValueError, match="no regular file"):
+        locked(tmp_path).__enter__()
+    assert (tmp_path / "precious").read_text() == "precious"
+
+
+def test_of_many_threads_one_at_a_time_writes(tmp_path):
+    at_once, most, done, refused = 0, 0, 0, 0
+
+    def work() -> None:
+        nonlocal at_once, most, done, refused
+        for _ in range(30):
+            try:
+                with locked(tmp_path / "run"):
+                    at_once += 1
+                    most, done = max(most, at_once), done + 1
+                    time.sleep(0.001)
+                    at_once -= 1
+            except ValueError:
+                refused += 1
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == 1 and done and done + refused == 120
+
+
+def test_two_resumptions_do_not_train_the_same_run(other, tmp_path):
+    for number in range(12):
+        Image.new("RGB", (32, 32), (20 * number, 0, 0)).save(tmp_path / f"{number}.png")
+    images = read_images(tmp_path, 32)
+    with pytest.raises(ValueError, match=f"being written by process {other.pid}"):
+        train(resolve("small", ["image_size=32"]), images, tmp_path / "run", resume=True)
+    assert [file.name for file in (tmp_path / "run").iterdir()] == [LOCK_FILE]

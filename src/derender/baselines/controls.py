@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
@@ -161,9 +160,8 @@ def _each(images: ImageSet, describe: Any, progress: Progress | None) -> np.ndar
 
 def untrained_twin(model: Any, seed: int) -> Any:
     """The same settings, factors and renderer with fresh weights; torch's global generator is left alone."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return type(model)(model.settings, model.factors, model.renderer).to(model.device).eval()
+    twin = type(model).seeded(model.settings, seed, factors=model.factors, renderer=model.renderer)
+    return twin.to(model.device).eval()
 
 
 def untrained_features(

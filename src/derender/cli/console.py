@@ -10,7 +10,8 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,34 +86,28 @@ def progress_bar(description: str, unit: str = "images") -> Iterator[Callable[..
     Where standard error is no terminal, a plain line appears every half minute instead.
     """
     console, last = Console(stderr=True), time.monotonic()
-    phase, first, begin = "", 0, last
-
-    def say(done: int, total: int, note: str = "", description: str = description, unit: str = unit) -> None:
-        nonlocal last, phase, first, begin
-        if description != phase:  # its first item may wait for compiled code: the rest is estimated without
-            phase, first, begin = description, done, time.monotonic()
-        if time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
-            last = time.monotonic()
-            each = (last - begin) / max(1, done - first)
-            left = f", {duration((total - done) * each)} left" if done > first else ""
-            count = f"{description}: {done:,} of {total:,} {unit}".rstrip()
-            notice(f"{count}{left} {note}".rstrip())
-
-    if not console.is_terminal or not is_main_process():
-        yield say
-        return
+    lively = console.is_terminal and is_main_process()
     columns = (
         bars.SpinnerColumn(), bars.TextColumn("{task.description}", markup=False), bars.BarColumn(),
         bars.TaskProgressColumn(), bars.MofNCompleteColumn(),
         bars.TextColumn("{task.fields[unit]}", markup=False), bars.TimeRemainingColumn(compact=True),
         bars.TextColumn("{task.fields[note]}", style="dim", markup=False),
     )  # fmt: skip
-    with bars.Progress(*columns, console=console) as progress:
-        task = progress.add_task(description, total=None, unit=unit, note="")
+    progress = bars.Progress(*columns, console=console, get_time=time.monotonic, speed_estimate_period=inf)
+    number = progress.add_task(description, total=None, unit=unit, note="")
+    (task,) = progress.tasks
 
-        def report(done: int, total: int, note: str = "", **fields: Any) -> None:
-            progress.update(task, completed=done, total=total, note=note, **fields)
+    def report(done: int, total: int, note: str = "", **fields: Any) -> None:
+        nonlocal last
+        if fields.get("description", task.description) != task.description:
+            progress.reset(number)  # the first item of a phase may wait for compiled code
+        progress.update(number, completed=done, total=total, note=note, **fields)
+        if not lively and time.monotonic() - last >= PLAIN_LINE_EVERY_SECONDS:
+            last, left = time.monotonic(), task.time_remaining
+            count = f"{task.description}: {done:,} of {total:,} {task.fields['unit']}".rstrip()
+            notice(f"{count}{'' if left is None else f', {duration(left)} left'} {note}".rstrip())
 
+    with progress if lively else nullcontext():
         yield report
 
 

@@ -3,8 +3,7 @@
 from functools import partial
 from typing import TYPE_CHECKING
 
-from derender.cli.images import ImageFiles, opener_of
-from derender.cli.options import ImageModel, Output, command, option
+from derender.cli.options import ImageFiles, ImageModel, Output, command, opener_of, option
 from derender.report.options import MESH_FORMATS, MESH_SIZE, TEXTURE_SIZE, ImageOptions
 from derender.storage.places import require_known
 

@@ -4,8 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from derender.cli.images import ImageFiles, opener_of
-from derender.cli.options import ImageModel, Output, command, option
+from derender.cli.options import ImageFiles, ImageModel, Output, command, opener_of, option
 from derender.report.options import EDIT_SIZE, FilmOptions, ImageOptions
 
 FACTOR = "Factor to take; may be repeated. By default each in turn."

@@ -8,20 +8,21 @@ command that reads images is one field here, used in one method here.
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from derender.cli.console import progress_bar, report_images, result, write_json
-from derender.report.options import option
+from derender.cli.console import notice, progress_bar, report_images, result, write_json
+from derender.report.options import ImageOptions, option
 from derender.storage.places import (
     DEVICES,
     bundled_models,
     hub_id,
     model_folder,
+    require_image,
     require_images,
     require_known,
 )
@@ -29,6 +30,9 @@ from derender.storage.places import (
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
+    from derender.photo.video import Edit as VideoEdit
+    from derender.report.editing import Edited
+    from derender.report.opening import ImageOpener, OpenedImage
 
 MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {', '.join(bundled_models())}."
 IMAGES = "Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it."
@@ -216,3 +220,52 @@ class GeneratedOptions:
     benchmark: bool = option(False, "Write the fixed sets of published scores.", "--benchmark")
     overrides: Settings = None
     json_file: Json = None
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """Image files, and the folder for what is made of them."""
+
+    images: Annotated[
+        list[Path], typer.Argument(help="Image files, videos, or folders of them.", metavar="IMAGE...")
+    ]
+    out: OutFolder
+    resume: Annotated[bool, typer.Option("--resume", help="Leave out images that are done.")] = False
+
+    def __post_init__(self) -> None:
+        require_image(self.images)
+
+    def edit(
+        self,
+        opener: "ImageOpener",
+        edit: "Callable[[OpenedImage], Edited]",
+        output: Output,
+        *,
+        sheet: bool | None = None,
+        beside: "Sequence[OpenedImage]" = (),
+        video: "VideoEdit | None" = None,
+    ) -> None:
+        """Edit and write every image and report it; exit code 2 where one that was named cannot be read."""
+        from derender.report.editing import write_images
+
+        with progress_bar("drawing", "images") as report:
+            written = write_images(
+                opener, self.images, self.out, edit,
+                force=output.force, resume=self.resume, sheet=sheet, beside=beside, video=video,
+                progress=report,
+            )  # fmt: skip
+        for note in written.notes():
+            notice(note)
+        count = len(written.images)
+        output.result(f"{count:,} image{'s' if count != 1 else ''} in {self.out}")
+        output.write(written.values())
+        if set(written.refused) & {str(path) for path in self.images}:  # of a folder others were used
+            raise typer.Exit(2)
+
+
+def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: Any) -> "ImageOpener":
+    """What opens images: the loaded model with the options."""
+    from derender.report.opening import ImageOpener, held_out_errors
+
+    held_out = held_out_errors(model.model)
+    return ImageOpener(model.open(), how, default_size=default_size, held_out=held_out, **more)

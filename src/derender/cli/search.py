@@ -34,13 +34,16 @@ def search(
 
     how = {"metric": metric, "model": model, "copies": copies, "device": device}
     found = derender.search(features, like, factor, k, **how)
-    files, away = found.table.files, dict(zip(found.rows, found.distances, strict=True))
+    files = found.table.files
+    near = [
+        {"row": row, "file": files[row], "distance": distance, "labels": found.labels(row)}
+        for row, distance in zip(found.rows, found.distances, strict=True)
+    ]
     shown = [name for name in found.table.labels if name != "partition"][:LABELS_SHOWN]
     columns = (Column("distance", digits=4), *map(Column, shown))
-    rows = []
-    for row, distance in away.items():
-        labels = found.labels(row)
-        rows.append(Row(files[row], (distance, *(str(labels[name]) for name in shown))))
+    rows = [
+        Row(one["file"], (one["distance"], *(str(one["labels"][name]) for name in shown))) for one in near
+    ]
     caption = f"nearest to {like} by {factor}, {metric} distance, in {features} ({len(found.table):,} rows)"
     show_scores(ScoreTable(caption, "file", columns, rows), output.json_file)
     if found.unchecked:
@@ -60,9 +63,6 @@ def search(
         {
             "like": like, "factor": factor, "metric": metric, "table": features, "out": out,
             "same_picture": [files[row] for row in found.same_image],
-            "found": [
-                {"row": row, "file": files[row], "distance": distance, "labels": found.labels(row)}
-                for row, distance in away.items()
-            ],
+            "found": near,
         }
     )  # fmt: skip

@@ -6,7 +6,6 @@ now, the length is right, and a sample of rows has the recorded checksum. Otherw
 per source and setting: a new version takes the old one's place.
 """
 
-import hashlib
 import json
 import os
 import sys
@@ -36,12 +35,6 @@ def cache_folder() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     return base / "derender"
-
-
-def cache_file(folder: Path, name: str, key: tuple[object, ...]) -> Path:
-    """Where rows are cached: a source's name for people, and everything that tells it from others."""
-    digest = hashlib.sha256(repr(key).encode("utf-8", "backslashreplace")).hexdigest()
-    return folder / f"{name[:40]}-{digest[:16]}.pictures"
 
 
 def read_cache(

@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from derender.data.cache import cache_file, cache_folder, read_cache, write_cache
+from derender.data.cache import cache_folder, read_cache, write_cache
 from derender.data.image import FITS, READER_VERSION, Unreadable, quiet_pillow
 from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
@@ -243,8 +243,10 @@ def read_images(
         settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
         made_of = repr((settings, PIL.__version__, stream.identity()))
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
-        name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])
-        file = cache_file(cache_folder() if cache is None else Path(cache), name, (stream.place, settings))
+        name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])[:40]  # for people
+        told_apart = hashlib.sha256(repr((stream.place, settings)).encode("utf-8", "backslashreplace"))
+        folder = cache_folder() if cache is None else Path(cache)
+        file = folder / f"{name}-{told_apart.hexdigest()[:16]}.pictures"
         if (cached := read_cache(file, fingerprint, image_size)) is None:
             write_cache(file, fingerprint, image_size, kept(), found.content)
             if (cached := read_cache(file, fingerprint, image_size)) is None:

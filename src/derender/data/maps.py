@@ -46,29 +46,17 @@ class MaskedImages(NamedTuple):
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """N rendered images with everything that made them.
+    """N rendered images with everything that made them; maps are 0 in the background."""
 
-    Attributes:
-        images: (N, 3, H, W) RGB.
-        depth: (N, H, W) z in the camera frame; 0 where there is background.
-        normal: (N, H, W, 3) inward unit normals in the camera frame, zero in the background; or None.
-        albedo: (N, 3, H, W) in 0..1, zero in the background; or None.
-        mask: (N, H, W) true on the object.
-        light: (N, 4) ambient, diffuse, pitch, yaw (radians, canonical frame); or None.
-        camera: (N, 6) rotation about x, y, z (radians), translation along x, y, z (z is 0); or None.
-        files: the images' names, relative to the source.
-        labels: the other columns (identity, expression, class, ...).
-    """
-
-    images: UInt8[np.ndarray, "n 3 h w"]
-    depth: Float32[np.ndarray, "n h w"]
-    normal: Float32[np.ndarray, "n h w 3"] | None
-    albedo: Float32[np.ndarray, "n 3 h w"] | None
-    mask: Bool[np.ndarray, "n h w"]
-    light: Float32[np.ndarray, "n 4"] | None
-    camera: Float32[np.ndarray, "n 6"] | None
-    files: tuple[str, ...]
-    labels: Labels
+    images: UInt8[np.ndarray, "n 3 h w"]  # RGB
+    depth: Float32[np.ndarray, "n h w"]  # z in the camera frame
+    normal: Float32[np.ndarray, "n h w 3"] | None  # inward unit normals in the camera frame
+    albedo: Float32[np.ndarray, "n 3 h w"] | None  # 0..1
+    mask: Bool[np.ndarray, "n h w"]  # true on the object
+    light: Float32[np.ndarray, "n 4"] | None  # ambient, diffuse, pitch, yaw (radians, canonical frame)
+    camera: Float32[np.ndarray, "n 6"] | None  # rotation about x, y, z (radians), translation (z is 0)
+    files: tuple[str, ...]  # relative to the source
+    labels: Labels  # the other columns (identity, expression, class, ...)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -319,11 +307,8 @@ def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -
 
 
 def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarray, "h w"]:
-    """One depth map, z with 0 for background; at ``size`` if given.
-
-    Maps are shrunk by area, over the object's pixels alone; a pixel is on the object where more than half of
-    it is.
-    """
+    """One depth map, z with 0 for background; at ``size`` if given, shrunk by area over the object's pixels.
+    A pixel is on the object where more than half of it is."""
     opened = _opened(source, file)
     mode, code = opened.mode, np.asarray(opened)
     if mode == "RGB" and (code == code[..., :1]).all():

@@ -147,17 +147,14 @@ def with_verdicts(rows: Sequence[ScoredRow], *, lower: Collection[str] = ()) -> 
 
     Scores named in ``lower`` are better where they are lower.
     """
-    controls = [row for row in rows if row.control]
-
-    def versus(row: ScoredRow) -> dict[str, Difference]:
-        rivals = {name: {c.name: c.scores[name] for c in controls if name in c.scores} for name in row.scores}
-        return {
-            name: difference(row.scores[name], own, lower=name in lower)
-            for name, own in rivals.items()
-            if own
-        }
-
-    return tuple(row if row.control else replace(row, versus=versus(row)) for row in rows)
+    controls, judged = [row for row in rows if row.control], []
+    for row in rows:
+        versus = {}
+        for name, one in row.scores.items() if not row.control else ():
+            if rivals := {other.name: other.scores[name] for other in controls if name in other.scores}:
+                versus[name] = difference(one, rivals, lower=name in lower)
+        judged.append(row if row.control else replace(row, versus=versus))
+    return tuple(judged)
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:

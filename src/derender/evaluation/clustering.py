@@ -49,8 +49,6 @@ from derender.evaluation.score_table import (
 )
 from derender.features import missing
 
-K_MEANS_SEEDS = 5
-
 
 def cluster(
     features: FeatureSource,
@@ -166,7 +164,7 @@ def compare_clusterings(
     for name, arrays in features.items():
         runs[name] = []
         for array in arrays:
-            for one in range(seed, seed + (K_MEANS_SEEDS if method == "k-means" else 1)):
+            for one in range(seed, seed + (5 if method == "k-means" else 1)):
                 own = np.asarray(array)[labelled]
                 cuts = clusterings(own, clusters.values(), method, seed=one, memory=memory)
                 runs[name].append({label: cuts[count] for label, count in clusters.items()})

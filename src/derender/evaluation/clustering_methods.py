@@ -35,7 +35,6 @@ from derender.evaluation import neighbours
 from derender.evaluation.memory import Memory
 from derender.evaluation.neighbours import (
     CELL_ROWS,
-    TILE,
     cells,
     finite_rows,
     nearest_rows,
@@ -44,7 +43,7 @@ from derender.evaluation.neighbours import (
 from derender.features import named
 
 FLOAT64_ROWS = 20_000  # above, nearest neighbours are looked up in float32; heights are always float64
-COMPACT_AT = 0.1  # share of merged-away rows at which they are removed
+TILE = 1_024
 LEAVES = 16_384
 """Clusters that the cells leave; more cannot be asked for."""
 
@@ -87,7 +86,7 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
         touched = np.zeros(len(means), bool)
         touched[first] = touched[second] = True
         stale = np.flatnonzero((touched | touched[nearest]) & (sizes > 0))
-        if (sizes == 0).mean() > COMPACT_AT:
+        if (sizes == 0).mean() > 0.1:  # rows that were merged away are removed
             kept = np.flatnonzero(sizes > 0)
             place = np.zeros(len(means), np.int64)
             place[kept] = np.arange(len(kept))

@@ -51,8 +51,6 @@ from derender.training.config import FeatureSettings, TrainConfig
 from derender.training.features import Describe, fit_whitening
 
 UNTRAINED = "untrained encoder"
-MISSING_CONTROLS = "without images there are no pixels, PCA and untrained encoder to compare with"
-DEFAULT_SIZE = 64  # of the controls beside features of an unknown architecture
 _SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
 
@@ -75,10 +73,10 @@ def with_controls(rows: Sequence[FeatureRow], options: Options) -> list[FeatureR
     """The rows, and behind them the controls of their images; without images there are none."""
     check_rows(rows)
     if options.images is None:
-        options.notes.append(MISSING_CONTROLS)
+        options.notes.append("without images there are no pixels, PCA and untrained encoder to compare with")
         return list(rows)
     settings = architecture(rows)
-    size = DEFAULT_SIZE if settings is None else settings.network.image_size
+    size = 64 if settings is None else settings.network.image_size
     return [*rows, *control_rows(options.at(size, rows[0].tables[0].files), settings, options)]
 
 

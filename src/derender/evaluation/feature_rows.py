@@ -17,7 +17,8 @@ from derender.baselines import load_baseline
 from derender.data import ImageSet
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import DEFAULT_FACTORS, Options
-from derender.features import FeatureTable, embed_images, missing, model_fingerprint, table_labels
+from derender.features import FeatureTable, embed_images, missing, table_labels
+from derender.features.extract import model_facts
 from derender.inputs import Progress, as_model, device_named
 from derender.model import Derenderer
 from derender.storage.folder import CONFIG_FILE, saved_config
@@ -124,14 +125,11 @@ def embedded_table(
     model: Any, images: ImageSet, memory: Memory, progress: Progress | None = None
 ) -> FeatureTable:
     """A model's features of images, cached by the content of both; names and labels are the images'."""
-    inputs = {"weights": model_fingerprint(model), "images": images.images}
+    origin = model_facts(model, images.source, images.layout)
+    inputs = {"weights": origin["weights"], "images": images.images}
     factors = memory.recall(
         "embedding", inputs, lambda: embed_images(model, images.images, progress=progress)
     )
-    origin = {
-        "data": images.source, "layout": images.layout, "model": type(model).__name__,
-        "settings": model.settings.model_dump(mode="json"), "weights": inputs["weights"],
-    }  # fmt: skip
     return FeatureTable(images.files, factors, table_labels(images), origin)
 
 

@@ -232,23 +232,16 @@ class FinetuneStep(nn.Module):
     """
 
     def __init__(
-        self,
-        model: FinetunedModel,
-        config: FinetuneConfig,
-        labels: Float[Tensor, "n a"],
+        self, model: FinetunedModel, config: FinetuneConfig, labels: Float[Tensor, "n a"],
         perceptual: PerceptualFeatures | None,
-    ):
+    ):  # fmt: skip
         super().__init__()
         self.model, self.config, self.labels, self.perceptual = model, config, labels, perceptual
 
     def forward(
-        self,
-        images: Tensor,
-        generator: Generator,
-        precision: Precision,
-        done: float | None = None,
+        self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None,
         rows: Tensor | None = None,
-    ) -> tuple[Tensor, Held]:
+    ) -> tuple[Tensor, Held]:  # fmt: skip
         assert rows is not None
         config, target, head = self.config, self.config.target, self.model.head
         if target.rendering_weight == 0:

@@ -180,14 +180,38 @@ def compare_prepared(
 ) -> LinearComparison:
     """Ask rows that were put side by side for all their labels, in their owners' split where there is one.
 
-    ``models``, by name, are trained together with the head; with ``supervised`` a ResNet-18, too. ``rows``
-    are test_fraction and groups of ``choose_rows``.
+    ``models``, by name, are trained together with the head; with ``supervised`` a ResNet-18, too. Seed s
+    trains run s of a model modulo their number. ``rows`` are test_fraction and groups of ``choose_rows``.
     """
     task = task_of(ready.labels)
     split = choose_rows(task, counts=counts, seeds=seeds, **ready.split, **rows)
-    tuned = None
-    if models:
-        tuned = finetuned_answers(models, ready, task, split, seeds, settings, options, supervised)
+
+    def learned(model: Any, count: int, at: int, what: str) -> np.ndarray:
+        training, images = split.train[count][at], options.at(model.image_size, ready.table.files).images
+        own = [factor.name for factor in model.factors] if isinstance(model, Derenderer) else model.chosen
+        chosen = list((isinstance(model, Derenderer) and options.chosen) or own)
+        inputs = {
+            "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
+            "rows": training, "tested": split.test, "seed": seeds[at], "factors": chosen,
+            "settings": settings.model_dump(),
+        }  # fmt: skip
+        progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
+        how: dict[str, Any] = {"seed": seeds[at], "settings": settings, "progress": progress}
+        learn = partial(finetune, model, images, task, training, split.test, factors=chosen, **how)
+        return options.memory.recall_one("finetuned", inputs, learn)
+
+    trained = trained_models(models or {}, seeds, options.device, supervised)
+    tuned = {
+        name: {
+            count: np.stack([learned(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
+            for count in split.train
+        }
+        for name, runs in trained.items()
+    }
+    for name in ready.controls if models else ():
+        if not name.startswith(UNTRAINED):  # no encoder to train: the answers of the head alone
+            arrays, how = ready.features[name], (split.test, seeds, settings, options.memory)
+            tuned[name] = {n: probe_runs("linear", arrays, task, own, *how) for n, own in split.train.items()}
     return compare_linear(
         ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
         settings=settings, resample_count=options.resamples, memory=options.memory,
@@ -324,58 +348,17 @@ def finetune(
         return np.concatenate([probabilities(head(embed(part)), task.kind).cpu().numpy() for part in parts])
 
 
-def finetuned_answers(
-    models: Mapping[str, Sequence[ModelSource]],
-    ready: Prepared,
-    task: Task,
-    split: Rows,
-    seeds: Sequence[int],
-    settings: HeadSettings,
-    options: Options,
-    supervised: bool,
-) -> dict[str, dict[int, np.ndarray]]:
-    """By row name and number of labels, (S, T, A) answers: models, untrained ones, and other controls' heads.
-
-    Seed s trains run s of a model modulo their number; ``supervised`` adds a ResNet-18 with fresh weights.
-    ``options`` hold the images and the factors whose encoders are trained.
-    """
-
-    def answers(model: Any, count: int, at: int, what: str) -> np.ndarray:
-        rows, images = split.train[count][at], options.at(model.image_size, ready.table.files).images
-        own = [factor.name for factor in model.factors] if isinstance(model, Derenderer) else model.chosen
-        chosen = list((isinstance(model, Derenderer) and options.chosen) or own)
-        inputs = {
-            "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
-            "rows": rows, "tested": split.test, "seed": seeds[at], "factors": chosen,
-            "settings": settings.model_dump(),
-        }  # fmt: skip
-        progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
-        how: dict[str, Any] = {"seed": seeds[at], "settings": settings, "progress": progress}
-        learn = partial(finetune, model, images, task, rows, split.test, factors=chosen, **how)
-        return options.memory.recall_one("finetuned", inputs, learn)
-
-    trained = {name: [opened(run, options.device) for run in runs] for name, runs in models.items()}
-    first = next((run for runs in trained.values() for run in runs if isinstance(run, Derenderer)), None)
-    if first is not None:
-        trained[UNTRAINED] = [untrained_twin(first, seed) for seed in seeds]
+def trained_models(
+    models: Mapping[str, Sequence[ModelSource]], seeds: Sequence[int], device: str, supervised: bool
+) -> dict[str, list[Any]]:
+    """By row name, the models to train: those given, untrained ones, and ResNet-18 with fresh weights."""
+    trained = {name: [opened(run, device) for run in runs] for name, runs in models.items()}
+    ours = [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]
+    if ours:
+        trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
     if supervised:
         from derender.baselines.supervised import fresh_resnet18
 
         size = next(iter(trained.values()))[0].image_size
-        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device_named(options.device)) for seed in seeds]
-    found = {
-        name: {
-            count: np.stack([answers(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
-            for count in split.train
-        }
-        for name, runs in trained.items()
-    }
-    for name in ready.controls:
-        if not name.startswith(UNTRAINED):
-            found[name] = {
-                count: probe_runs(
-                    "linear", ready.features[name], task, rows, split.test, seeds, settings, options.memory
-                )
-                for count, rows in split.train.items()
-            }
-    return found
+        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device_named(device)) for seed in seeds]
+    return trained

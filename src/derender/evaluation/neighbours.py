@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from derender.data import usable_cores
 
 T = TypeVar("T")
-TILE = 1_024
 NUMBERS_AT_ONCE = 1 << 23
 
 EXACT_ROWS = 100_000
@@ -30,10 +29,6 @@ NEAR_CELLS = 4
 
 CELL_ROWS = 2_000
 """Rows that a cell is to have; none has more than four times as many."""
-
-_SAMPLED_PER_CELL = 32
-_ROUNDS = 6
-_CENTRE_TILE = 2_048
 
 
 def finite_rows(features: np.ndarray, purpose: str) -> np.ndarray:
@@ -108,7 +103,7 @@ def cells(points: Float32[np.ndarray, "n d"], rows_per_cell: int) -> list[Int64[
             groups.append(rows)
             continue
         wanted = -(-len(rows) // rows_per_cell)
-        sampled = generator.choice(rows, min(len(rows), _SAMPLED_PER_CELL * wanted), replace=False)
+        sampled = generator.choice(rows, min(len(rows), 32 * wanted), replace=False)
         found = _nearest_centre(points, rows, _centres(points[np.sort(sampled)], wanted, generator))
         parts = [rows[found == one] for one in np.unique(found)]
         if len(parts) == 1:  # copies of one row: no centre tells them apart
@@ -126,7 +121,7 @@ def of_each(work: Callable[[int], T], groups: Sequence[np.ndarray]) -> Iterator[
 
 def _centres(sample: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
     centres = sample[generator.choice(len(sample), wanted, replace=False)].copy()
-    for _ in range(_ROUNDS):
+    for _ in range(6):
         found = _nearest_centre(sample, np.arange(len(sample)), centres)
         order = np.argsort(found, kind="stable")
         held, first = np.unique(found[order], return_index=True)
@@ -136,9 +131,6 @@ def _centres(sample: np.ndarray, wanted: int, generator: np.random.Generator) ->
 
 
 def _nearest_centre(points: np.ndarray, rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """For each of these rows the nearest centre."""
-    found, half_square = np.empty(len(rows), np.int64), (centres**2).sum(axis=1) / 2
-    for start in range(0, len(rows), _CENTRE_TILE):
-        part = slice(start, start + _CENTRE_TILE)
-        found[part] = (half_square - points[rows[part]] @ centres.T).argmin(axis=1)
-    return found
+    half_square = (centres**2).sum(axis=1) / 2
+    parts = np.split(rows, range(2_048, len(rows), 2_048))
+    return np.concatenate([(half_square - points[part] @ centres.T).argmin(axis=1) for part in parts])

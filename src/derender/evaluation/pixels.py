@@ -24,8 +24,6 @@ from derender.features import Progress, map_batches
 
 COMPONENTS = 64
 WINDOW = 11
-SIGMA = 1.5
-AT_A_TIME = 32  # images: convolutions with windows this large take memory
 
 
 @dataclass(frozen=True)
@@ -176,14 +174,13 @@ def masked_ssim(
     if min(target.shape[-2:]) < WINDOW:
         return torch.full((len(target),), torch.nan, dtype=torch.float64)
     found = []
-    for shown, true, covered in zip(
-        *(v.split(AT_A_TIME) for v in (prediction, target, mask > 0)), strict=True
-    ):
+    parts = (values.split(32) for values in (prediction, target, mask > 0))  # such convolutions take memory
+    for shown, true, covered in zip(*parts, strict=True):
         hole = torch.nn.functional.pad((~covered).float(), (WINDOW // 2,) * 4, value=1.0)
         inside = torch.nn.functional.max_pool2d(hole[:, None], WINDOW, stride=1)[:, 0] == 0  # window centres
         one, other = (torch.where(covered[:, None], values.float(), 0.0) for values in (shown, true))
         _, similarity = structural_similarity_index_measure(
-            one, other, data_range=1.0, sigma=SIGMA, reduction="none", return_full_image=True
+            one, other, data_range=1.0, sigma=1.5, reduction="none", return_full_image=True
         )
         total = torch.where(inside, torch.as_tensor(similarity).mean(dim=1), 0.0).sum(dim=(1, 2))
         found.append(total.double() / inside.sum(dim=(1, 2)))

@@ -148,9 +148,8 @@ def optimised(model: Derenderer, steps: int | None) -> Derenderer:
 
 @dataclass(frozen=True)
 class CopyCost:
-    """What changed: by factor, how far an image's feature moved (mean over images, over the root mean square
-    distance of two images' features; 0: not at all), and the mean absolute error of the images re-rendered,
-    0..1, inside each one's mask, by the copy and by the model.
+    """By factor how far an image's feature moved: the mean, over the root mean square distance of two images.
+    Mean absolute error of the images re-rendered by the copy, and before, by the model.
     """
 
     moved: dict[str, float]
@@ -161,25 +160,17 @@ class CopyCost:
 def copy_cost(
     model: Derenderer, other: Derenderer, images: np.ndarray, *, progress: Progress | None = None
 ) -> CopyCost:
-    """Compare a copy of a model, ``other``, with it on uint8 images (N, 3, H, W).
+    """Compare a copy of a model, ``other``, with it on two or more uint8 images (N, 3, H, W).
 
     ``progress`` is called with (features made, features to make), two of each image.
-
-    Raises:
-        ValueError: fewer than two images, or other factors.
     """
-    if len(images) < 2:
-        raise ValueError(f"two images or more are needed to compare models, got {len(images)}")
-    names = [[factor.name for factor in one.factors] for one in (model, other)]
-    if names[0] != names[1]:
-        raise ValueError(f"the models have other factors: {', '.join(names[0])}; {', '.join(names[1])}")
     passes = []
     for number, one in enumerate((model, other)):
         report = progress and partial(lambda start, done, of: progress(start * of + done, 2 * of), number)
         passes.append(embed_images(one, images, progress=report))
     moved = {}
-    for name in names[0]:
-        own, moved_to = (np.asarray(one[name], np.float64) for one in passes)
+    for name, feature in passes[0].items():
+        own, moved_to = np.asarray(feature, np.float64), np.asarray(passes[1][name], np.float64)
         apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two images drawn at random
         moved[name] = float(np.linalg.norm(own - moved_to, axis=1).mean() / apart) if apart else 0.0
     errors = [evaluate_reconstruction(one, images).model.l1 for one in (other, model)]

@@ -22,6 +22,16 @@ def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
     return values[name]
 
 
+def chosen(factors: Sequence[str] | None, among: Mapping[str, Any]) -> list[str]:
+    """Names of factors, one or several, None for all; none, or one that is not there, is an error."""
+    names = [factors] if isinstance(factors, str) else list(among if factors is None else factors)
+    if not names:
+        raise ValueError(f"name at least one factor; there is {', '.join(among)}")
+    for name in names:
+        named(among, name, "factor")
+    return names
+
+
 @dataclass(frozen=True, eq=False)
 class FeatureTable:
     """N images, one feature per factor each.
@@ -69,10 +79,7 @@ class FeatureTable:
 
     def concatenate(self, factors: Sequence[str] | None = None) -> np.ndarray:
         """Features of several factors side by side, (N, sum of D) float32; all of them by default."""
-        names = [factors] if isinstance(factors, str) else list(self.factors if factors is None else factors)
-        if not names:
-            raise ValueError(f"name at least one factor; there is {', '.join(self.factors)}")
-        return np.concatenate([named(self.factors, name, "factor") for name in names], axis=1)
+        return np.concatenate([self.factors[name] for name in chosen(factors, self.factors)], axis=1)
 
     def label(self, name: str) -> np.ndarray:
         """One label column; an unknown name is an error that names the nearest."""

@@ -1,7 +1,7 @@
 """DisentangledFeatures: a trained model as a step of a scikit-learn pipeline."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import derender
 from derender.data import read_image
 from derender.data.image import refuse_values
 from derender.features.extract import embed_images
-from derender.features.table import named
+from derender.features.table import chosen
 
 
 class DisentangledFeatures(TransformerMixin, BaseEstimator):
@@ -44,7 +44,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
         """(N, sum of D) float32."""
         model = self._loaded()
         codes = embed_images(model, as_pixels(X, model.image_size), batch_size=self.batch_size)
-        return np.concatenate([codes[name] for name in self._chosen(codes)], axis=1)
+        return np.concatenate([codes[name] for name in chosen(self.factors, codes)], axis=1)
 
     def get_feature_names_out(self, input_features: Any = None) -> np.ndarray:
         """Names such as ``geometry_0``, in the order of the columns."""
@@ -63,16 +63,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
     def _widths(self) -> dict[str, int]:
         model = self._loaded()
         codes = embed_images(model, np.zeros((1, 3, model.image_size, model.image_size), np.uint8))
-        return {name: codes[name].shape[1] for name in self._chosen(codes)}
-
-    def _chosen(self, codes: Mapping[str, Any]) -> list[str]:
-        factors = codes if self.factors is None else self.factors
-        names = [factors] if isinstance(factors, str) else list(factors)
-        if not names:
-            raise ValueError(f"name at least one factor; there is {', '.join(codes)}")
-        for name in names:
-            named(codes, name, "factor")
-        return names
+        return {name: codes[name].shape[1] for name in chosen(self.factors, codes)}
 
     def __getstate__(self) -> dict[str, Any]:
         """Parameters only: a model named by its path is loaded again where the copy is used."""

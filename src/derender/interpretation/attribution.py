@@ -30,7 +30,6 @@ from torch.nn.functional import interpolate
 from derender.baselines.controls import untrained_twin
 from derender.baselines.model import optional
 from derender.evaluation.pixels import masked_ssim
-from derender.features import named
 from derender.interpretation.probe import Probe
 from derender.networks.encoders import activations
 from derender.storage.places import require_known
@@ -65,8 +64,6 @@ def integrated_gradients(
     completeness errors: their sum less the change of the answer.
     """
     require_known("output", output, OUTPUTS)
-    if features.ndim != 2 or features.shape[1] != probe.weight.shape[1]:
-        raise ValueError(f"the probe takes features (N, {probe.weight.shape[1]}), got {features.shape}")
     together = output == "probability" and probe.kind == "classes"  # only there the other answers matter
     rows = slice(None) if together else slice(target, target + 1)
     weight, bias = (torch.from_numpy(v[rows].astype(np.float64)) for v in (probe.weight, probe.bias))
@@ -104,19 +101,15 @@ def saliency(
     probe: Probe | None = None,
     targets: Sequence[int] | np.ndarray = (),
 ) -> Float[Tensor, "n height width"]:
-    """A map by the name of its method, none below 0: 4 x 4 for the two CAMs, the image's size for pixels.
+    """A map by one of ``METHODS``, none below 0: 4 x 4 for the two CAMs, the image's size for pixels.
 
     The encoder of ``factor`` has ``spatial`` and ``to_code``; images are in 0..1. The probe's logit for the
     (n,) label or class of each image is explained; None explains the feature itself (half its squared
     length).
     """
-    require_known("method", method, METHODS)
     weight = None
     if probe is not None:
-        columns = named(probe.slices, factor, "factor of the probe")
-        weight = torch.from_numpy(probe.weight[np.asarray(targets, np.int64), columns]).to(images)
-        if len(weight) != len(images):
-            raise ValueError(f"{len(images)} images need as many targets, got {len(weight)}")
+        weight = torch.from_numpy(probe.weight[np.asarray(targets), probe.slices[factor]]).to(images)
     if method == "pixels":
         return pixel_attribution(model, images, factor, weight)
     features, gradient = _at_features(model, images, factor, weight)
@@ -214,8 +207,6 @@ def sanity_check(
     ``probe`` is explained, ``shuffled`` learned shuffled labels. Two ``images`` or more are in 0..1,
     ``targets`` the label or class explained for each.
     """
-    if len(images) < 2:
-        raise ValueError(f"a sanity check compares maps of 2 images or more, got {len(images)}")
     twins, found = [untrained_twin(model, seed) for seed in seeds], []
     for method in methods:
         for factor in probe.factors:

@@ -15,9 +15,9 @@ from sklearn.metrics import roc_auc_score
 
 from derender.baselines.controls import untrained_features
 from derender.data import ImageSet, suggestion
-from derender.evaluation.bootstrap import LEVEL, resamples
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.feature_rows import chosen_labels
+from derender.evaluation.image_scores import image_rows
 from derender.evaluation.linear_task import Rows, Task, choose_rows
 from derender.evaluation.score_table import Scores
 from derender.features import FeatureTable, embed_image_set
@@ -254,19 +254,11 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
 def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> ShareRow:
     shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
     known = np.ma.masked_invalid(shares)
-    per_seed, (low, high) = known.mean(axis=1).filled(np.nan), _interval(known.mean(axis=0))
+    each = known.mean(axis=0).filled(np.nan)  # of images
+    cells = {str(at): values for at, values in enumerate(each.reshape(len(each), -1).T)}
+    (scored,) = image_rows({name: cells}, {}, controls=[name], resample_count=BOOTSTRAP)
+    ends = np.array([(one.low, one.high) for one in scored.scores.values()])
+    low, high = ends.T.reshape(2, *each.shape[1:])
     error, scale = largest.max(axis=0)
     error = float(error / scale) if scale > 0 else 0.0
-    return ShareRow(name, name != "model", per_seed, low, high, auc, drop, error)
-
-
-def _interval(shares: np.ma.MaskedArray) -> np.ndarray:
-    """(T, A, F) as the ends of the 95 % interval of the mean over images, (2, A, F)."""
-    flat = shares.reshape(len(shares), -1)
-    weights = np.concatenate(list(resamples(len(shares), BOOTSTRAP)))
-    count = weights @ (~flat.mask).astype(np.float32)
-    total = weights @ flat.filled(0).astype(np.float32)
-    drawn = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
-    ends, some = np.full((2, drawn.shape[1]), np.nan), np.isfinite(drawn).any(axis=0)
-    ends[:, some] = np.nanquantile(drawn[:, some], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
-    return ends.reshape(2, *shares.shape[1:])
+    return ShareRow(name, name != "model", known.mean(axis=1).filled(np.nan), low, high, auc, drop, error)

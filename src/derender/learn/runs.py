@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +109,8 @@ def train(
     if this_rank_writes() and not resume:
         refuse_taken(out)
     with fabric.rank_zero_first(local=True):
-        images = _read(images, image_size_of(config), report, dataset, limit)
+        told = Progress.of("reading", report)
+        images = as_images(images, image_size_of(config), dataset=dataset, limit=limit, progress=told)
     if on_images is not None:
         on_images(images)
     ours = isinstance(config, TrainConfig)
@@ -130,16 +130,6 @@ def train(
 
         run_page(out, Evidence({"data": look_at_data(images)})).write(out / "report.html")
     return result
-
-
-def _read(
-    images: ImageSet | str | Path, image_size: int, report: Callable[[Progress], None], dataset: str,
-    limit: int | None,
-) -> ImageSet:  # fmt: skip
-    told = partial(Progress, "reading")
-    return as_images(
-        images, image_size, dataset=dataset, limit=limit, progress=lambda *counts: report(told(*counts))
-    )
 
 
 def texts_of(settings: Changes) -> list[str]:
@@ -229,7 +219,8 @@ def finetune(
     if not resume:
         refuse_taken(out)
     start = None if config.start is None else as_model(config.start, device="cpu")
-    images = _read(images, config.model.network.image_size, report, dataset, limit)
+    size, told = config.model.network.image_size, Progress.of("reading", report)
+    images = as_images(images, size, dataset=dataset, limit=limit, progress=told)
     if on_images is not None:
         on_images(images)
     if choices.get("attributes"):
@@ -249,6 +240,6 @@ def finetune(
     tuned = load_finetuned(out, device=accelerator)
     scores = score_finetuned(
         tuned, task, began=config.start or "fresh weights", memory=memory,
-        progress=lambda *counts: report(Progress("scoring", *counts)),
+        progress=Progress.of("scoring", report),
     )  # fmt: skip
     return Finetuned(run, scores, config.start)

@@ -37,25 +37,19 @@ class FactorNet(nn.Module):
 class Factor:
     """One row: what the factor is called, how it is predicted, what it means and how it is perturbed.
 
-    Attributes:
-        name: key of the network and of the feature column.
-        parameter: the field of `Scene` (or key of ``Scene.extra``) that it fills.
-        build: makes the factor's network.
-        to_parameter: gives a raw network output its physical range.
-        mirrored: whether the parameter is a map that the flipped twin of a scene shows mirrored.
-        perturb: draws, for each row, another physically possible value; None if LOOCC never perturbs it.
-        numbers: name and range of each column, for reports and sliders; none of a map. A mirror changes none.
-        rate: share of the learning rate at which its network is trained.
+    ``perturb`` draws, for each row, another physically possible value; None if LOOCC never perturbs it.
     """
 
-    name: str
-    parameter: str
-    build: Callable[[NetworkSettings], FactorNet]
-    to_parameter: Callable[[Tensor, SceneRanges], Tensor]
-    mirrored: bool
+    name: str  # key of the network and of the feature column
+    parameter: str  # the field of `Scene` (or key of ``Scene.extra``) that it fills
+    build: Callable[[NetworkSettings], FactorNet]  # makes the factor's network
+    to_parameter: Callable[[Tensor, SceneRanges], Tensor]  # gives a raw network output its physical range
+    mirrored: bool  # whether the parameter is a map that the flipped twin of a scene shows mirrored
     perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
-    numbers: tuple["Number", ...] = ()
-    rate: float = 1.0
+    numbers: tuple[
+        "Number", ...
+    ] = ()  # each column for reports and sliders; none of a map, no mirror changes
+    rate: float = 1.0  # share of the learning rate at which its network is trained
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,9 @@ def depth_smoothness(
 ) -> Float[Tensor, ""]:
     """Mean |step| to the next row plus mean |step| to the next column, in depth ranges; 0 is flat.
 
-    Source: unsup3d's code. ``border`` columns at each side, which the presets clamp, are left out.
+    Source: unsup3d's code. ``border`` columns at each side, which the presets clamp, are left out. Of
+    ``order`` 2 (curvature, no published source) steps are second differences: 0 for every plane. That
+    removes depth noise, which turns normals by tens of degrees, and stripes.
     """
     if depth_range <= 0:
         raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
@@ -59,16 +61,6 @@ def depth_smoothness(
         )
     rows, columns = (depth.diff(n=order, dim=axis).abs().mean() for axis in (1, 2))
     return (rows + columns) / depth_range
-
-
-def depth_curvature(
-    depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int = 0
-) -> Float[Tensor, ""]:
-    """Mean |second difference| down the columns plus along the rows, in depth ranges; 0 for every plane.
-
-    Removes depth noise, which turns normals by tens of degrees, and stripes. No published source.
-    """
-    return depth_smoothness(depth, depth_range, border, order=2)
 
 
 def masked_mean(

@@ -91,23 +91,15 @@ def without_normalisation(normalised: nn.Sequential, widths: tuple[int, int, int
 
 @dataclass(frozen=True)
 class SelfTraining:
-    """How the features are learned.
+    """How the features are learned: 2 * ``batch`` * ``places`` locations are contrasted in a step."""
 
-    Attributes:
-        widths: channels at full, half and quarter resolution.
-        batch, places: images a step, and locations sampled in each: 2 * batch * places are contrasted.
-        crop: side of the views in pixels, at most three quarters of the image.
-        projection: width of the head that is thrown away afterwards.
-        temperature, learning_rate, weight_decay: of NT-Xent; AdamW's, the rate at its peak.
-    """
-
-    widths: tuple[int, int, int] = DEFAULT_WIDTHS
-    batch: int = 32
-    places: int = 16
-    crop: int = 40
-    projection: int = 64
-    temperature: float = 0.2
-    learning_rate: float = 3e-3
+    widths: tuple[int, int, int] = DEFAULT_WIDTHS  # channels at full, half and quarter resolution
+    batch: int = 32  # images
+    places: int = 16  # locations sampled in each
+    crop: int = 40  # side of the views in pixels, at most three quarters of the image
+    projection: int = 64  # width of the head that is thrown away afterwards
+    temperature: float = 0.2  # of NT-Xent
+    learning_rate: float = 3e-3  # of AdamW, at its peak
     weight_decay: float = 1e-4
 
 

@@ -17,8 +17,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from derender.networks import FACTORS, Factor
-from derender.render import Rendering
-from derender.render.renderer import shade, warp
+from derender.render import Rendering, shade, warp
 from derender.render.shading import shade as lambert
 from derender.scene import Scene
 from derender.scene.camera import project, to_camera, unproject

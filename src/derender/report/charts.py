@@ -12,7 +12,7 @@ from hashlib import sha256
 from io import BytesIO, StringIO
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -44,7 +44,7 @@ _STYLE: dict[Any, Any] = {
     "grid.alpha": 0.12,
     "grid.linewidth": 0.7,
 }
-Draw = Callable[[Axes], object]
+T = TypeVar("T")
 
 
 def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str) -> str:
@@ -52,7 +52,7 @@ def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_labe
     if not series:
         raise ValueError("a chart needs at least one series")
 
-    def draw(axes: Axes) -> None:
+    def draw(axes: Axes, _: object) -> None:
         for (name, (x, y)), colour in zip(series.items(), cycle(SERIES), strict=False):
             marker, label = "o" if len(x) < 2 else None, name if len(series) > 1 else None
             axes.plot(x, y, color=colour, linewidth=1.8, label=label, marker=marker)
@@ -64,32 +64,33 @@ def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_labe
         )
 
     # a legend at the upper left is seen where charts scroll
-    return side_by_side({"": draw}, x_label, (7.2, 2.9), 3, "outside upper left")[0]
+    return side_by_side({"": None}, draw, x_label, (7.2, 2.9), 3, "outside upper left")[0]
 
 
 def bars(values: Mapping[str, float], x_label: str, highlighted: Sequence[str] = ()) -> str:
     """One bar a name, ``highlighted`` ones in colour, as SVG text."""
     names = list(values)[::-1]
 
-    def draw(axes: Axes) -> None:
+    def draw(axes: Axes, _: object) -> None:
         tints = [SERIES[0] if name in highlighted else CONTROL_COLOUR for name in names]
         drawn = axes.barh(names, [values[name] for name in names], color=tints, height=0.66)
         axes.bar_label(drawn, fmt="%.3g", padding=4, fontsize=9)
         axes.margins(x=0.12)
         axes.tick_params(axis="y", length=0)
 
-    return side_by_side({"": draw}, x_label, (7.2, 0.6 + 0.34 * len(values)))[0]
+    return side_by_side({"": None}, draw, x_label, (7.2, 0.6 + 0.34 * len(values)))[0]
 
 
 @matplotlib.rc_context(_STYLE)
 def side_by_side(
-    panels: Mapping[str, Draw],
+    panels: Mapping[str, T],
+    draw: Callable[[Axes, T], object],
     x_label: str,
     size: tuple[float, float],
     columns: int = 99,
     legend: Any = "outside lower left",
 ) -> tuple[str, bytes]:
-    """Panels by title with one vertical axis, each drawn by its function, as SVG text and as PNG on white.
+    """Panels by title with one vertical axis, drawn from their values, as SVG text and as PNG on white.
 
     A legend of the first panel's labels has at most so many columns.
     """
@@ -97,8 +98,8 @@ def side_by_side(
         raise ValueError("a chart needs at least one panel")
     figure = Figure(figsize=size, layout="constrained")
     drawn = list(figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0])
-    for axes, (title, draw) in zip(drawn, panels.items(), strict=True):
-        draw(axes)
+    for axes, (title, value) in zip(drawn, panels.items(), strict=True):
+        draw(axes, value)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel(x_label)
         axes.patch.set_alpha(0)

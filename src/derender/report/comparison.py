@@ -212,8 +212,7 @@ def protocol_picture(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -
         axes.set_axisbelow(True)
 
     size = (max(7.2, 1.6 + 2.1 * len(shown)), 0.9 + 0.3 * len(names))
-    panels = {one.name: lambda axes, one=one: panel(axes, one) for one in shown}
-    return side_by_side(panels, score.replace("_", " "), size)
+    return side_by_side({one.name: one for one in shown}, panel, score.replace("_", " "), size)
 
 
 def _shown(scores: Sequence[ScoredQuestion]) -> list[ScoredQuestion]:

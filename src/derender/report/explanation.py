@@ -200,5 +200,5 @@ def share_chart(found: Explanation) -> tuple[str, bytes]:
         axes.grid(True, axis="x")
         axes.set_axisbelow(True)
 
-    panels = {name: lambda axes, at=at: draw(axes, at) for at, name in enumerate(found.factors)}
-    return side_by_side(panels, "share of |IG|", (1.6 + 2.0 * len(panels), 1.3 + 0.24 * len(places)))
+    panels = {name: at for at, name in enumerate(found.factors)}
+    return side_by_side(panels, draw, "share of |IG|", (1.6 + 2.0 * len(panels), 1.3 + 0.24 * len(places)))

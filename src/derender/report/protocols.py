@@ -50,8 +50,9 @@ def robustness_chart(found: RobustnessComparison, score: str = "accuracy") -> tu
         if curve is found.curves[0]:
             axes.set_ylabel(SCORES[score])
 
-    panels = {curve.title: lambda axes, curve=curve: draw(axes, curve) for curve in found.curves}
-    return side_by_side(panels, "degrees off the front", (1.2 + 3.6 * max(2, len(panels)), 3.9), columns=5)
+    panels = {curve.title: curve for curve in found.curves}
+    size = (1.2 + 3.6 * max(2, len(panels)), 3.9)
+    return side_by_side(panels, draw, "degrees off the front", size, columns=5)
 
 
 def robustness_page(found: RobustnessComparison, model: str, score: str = "accuracy") -> Page:

@@ -30,7 +30,7 @@ SHEETS_SHOWN, SHEET_PX, SHEET_PIXEL_LIMIT = 4, 1080, 20_000_000
 Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
 Metrics = Sequence[Mapping[str, Any]]
 CHARTS = {
-    "l1": ("L1", "Mean absolute difference between image and reconstruction, inside the mask if any."),
+    "l1": ("L1", "Mean absolute difference of image and reconstruction, inside the mask if there is one."),
     "loss": ("loss", "Minimised loss, on held-out images. With a confidence net it can fall below zero: the "
              "logarithm of sigma is part of it."),
 }  # fmt: skip

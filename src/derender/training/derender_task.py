@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +64,8 @@ def _add_features(
     split = split_indices(images.files, config.split, seed=config.seed)
     mapped = isinstance(images.images, np.memmap)
     some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
-    told = partial(Progress, "features")
-    model = make_features(
-        model, some, config.features, seed=config.seed, progress=lambda *done: report(told(*done))
-    )
+    told = Progress.of("features", report)
+    model = make_features(model, some, config.features, seed=config.seed, progress=told)
     write_config(out, [factor.name for factor in model.factors], model.settings)
     model.features.save(out)
     held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]

@@ -9,7 +9,6 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from functools import partial
 from itertools import count, groupby, takewhile
 from math import isfinite
 from pathlib import Path
@@ -101,11 +100,9 @@ class _Run:
         self.model: Any = task.build().to(fabric.device)
         if config.channels_last:
             self.model.to(memory_format=torch.channels_last)
-        told = partial(Progress, "perceptual")
+        told = Progress.of("perceptual", self.report)
         with fabric.rank_zero_first():
-            step = task.step_module(
-                self.model, self.folder, batches.sample(), lambda *counts: self.report(told(*counts))
-            )
+            step = task.step_module(self.model, self.folder, batches.sample(), told)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
         self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True)

@@ -18,7 +18,7 @@ from derender.model import Derenderer
 from derender.networks.decoders import Confidence
 from derender.objectives.loocc import loocc_loss
 from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
-from derender.objectives.reconstruction import depth_curvature, depth_smoothness, masked_l1, photometric_loss
+from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import choose_factors
@@ -106,10 +106,10 @@ def training_step(
     ranges = model.settings.ranges
     inside = ranges.depth_max - ranges.depth_min, ranges.border_columns(model.image_size)
     finer = 2**model.settings.network.doublings  # differences between pixels are of the encoded size
-    if objective.smoothness_weight > 0:
-        terms["smoothness"] = finer * objective.smoothness_weight * depth_smoothness(scene.depth, *inside)
-    if objective.curvature_weight > 0:
-        terms["curvature"] = finer**2 * objective.curvature_weight * depth_curvature(scene.depth, *inside)
+    steps = {"smoothness": objective.smoothness_weight, "curvature": objective.curvature_weight}
+    for order, (name, weight) in enumerate(steps.items(), 1):
+        if weight > 0:
+            terms[name] = finer**order * weight * depth_smoothness(scene.depth, *inside, order)
     if model.renderer.penalty is not None:
         terms["penalty"] = model.renderer.penalty(scene, model.renderer.shading(scene, model.fov_deg))
     if left_out is not None:
@@ -221,10 +221,10 @@ def share_codes(
 ) -> dict[str, Float[Tensor, "n _"]]:
     """The codes of the named factors moved to their mean over the batch; ``own`` = 1 leaves them."""
     shared = dict(codes)
-    for name, code in codes.items() if own < 1 else ():
-        if name in names:
-            mean = ranks.gather(code).mean(dim=0, keepdim=True).to(code.dtype)
-            shared[name] = torch.lerp(mean.expand_as(code), code, own)
+    for name in names if own < 1 else ():
+        code = codes[name]
+        mean = ranks.gather(code).mean(dim=0, keepdim=True).to(code.dtype)
+        shared[name] = torch.lerp(mean.expand_as(code), code, own)
     return shared
 
 

@@ -106,6 +106,11 @@ class Progress:
     terms: dict[str, float] | None = None
     waiting: float = 0.0
 
+    @classmethod
+    def of(cls, phase: str, report: "Callable[[Progress], None]") -> PhaseProgress:
+        """A callback of (done, total) that reports them as of one phase."""
+        return lambda done, total: report(cls(phase, done, total))
+
 
 @dataclass(frozen=True)
 class TrainResult:

@@ -22,7 +22,7 @@ from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
 from derender.objectives.reconstruction import masked_mean
-from derender.render.renderer import warp
+from derender.render import warp
 from derender.training.distillation import MEASURED_IMAGES, StudentSettings
 
 ZOOM = (0.7, 1.25)

@@ -44,10 +44,9 @@ BOX_LIST = "boxes.csv"
 _PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
 _IN_ORDER = np.array(["", *_PARTITIONS.values()])  # the parts are runs of image numbers, from these on
 _FIRST_NUMBERS = (1, 162_771, 182_638)
-_EYES_AND_MOUTH = (
-    *("lefteye_x", "lefteye_y", "righteye_x", "righteye_y"),
-    *("leftmouth_x", "leftmouth_y", "rightmouth_x", "rightmouth_y"),
-)
+_EYES_AND_MOUTH = [
+    f"{side}{part}_{axis}" for part in ("eye", "mouth") for side in ("left", "right") for axis in "xy"
+]
 _SIZED, _SIDES = ("left", "top", "width", "height"), ("left", "top", "right", "bottom")
 _MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 
@@ -77,11 +76,7 @@ class _OwnersList(NamedTuple):
 def _owners_list(
     source: Source, stem: str, codes: Sequence[str] = (), meaning: str = ""
 ) -> _OwnersList | None:
-    """The list of that name, as the original text or as a CSV copy, or None when neither is there.
-
-    Errors are a row of another length, a value outside ``codes``, and a list with fewer rows than its first
-    line says.
-    """
+    """The list of that name, as the original text or as a CSV copy, or None when neither is there."""
     file = source.named(f"{stem}.txt", f"{stem}.csv")
     if file is None:
         return None

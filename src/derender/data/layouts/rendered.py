@@ -35,9 +35,9 @@ LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
 
 # by column of params.csv, what it is called here
-_NUMBERS = {name: name for name in ("strength", "age", "skin_tone", "ambient", "diffuse")}
+_SAME = ("strength", "age", "skin_tone", "ambient", "diffuse", "gloss_strength", "gloss_exponent")
+_NUMBERS = {name: name for name in (*_SAME, "haze_beta", "haze_airlight")}
 _NUMBERS |= {"tx": "camera_tx", "ty": "camera_ty"}
-_NUMBERS |= {name: name for name in ("gloss_strength", "gloss_exponent", "haze_beta", "haze_airlight")}
 _DEGREES = {"light_pitch": "light_pitch_rad", "light_yaw": "light_yaw_rad", "pitch": "camera_x_rad"}
 _DEGREES |= {"yaw": "camera_y_rad", "roll": "camera_z_rad", "elev": "elevation_rad", "azim": "azimuth_rad"}
 _TEXTS = (

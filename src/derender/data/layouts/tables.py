@@ -164,7 +164,8 @@ def _cells(source: Source, file: str) -> dict[str, list[str]]:
             f"column {nested[0]!r} of {file} in {source.path} holds {table.schema.field(nested[0]).type}; "
             f"expected paths, numbers and text (images kept inside a table are not read)"
         )
-    return {name: list(map(_text, table[name].to_pylist())) for name in table.column_names}
+    cells = {name: table[name].to_pylist() for name in table.column_names}
+    return {name: ["" if one is None or one != one else str(one) for one in cells[name]] for name in cells}
 
 
 def _not_cells(schema: Any) -> list[str]:
@@ -172,7 +173,3 @@ def _not_cells(schema: Any) -> list[str]:
     import pyarrow as pa
 
     return [one.name for one in schema if pa.types.is_nested(one.type) or pa.types.is_binary(one.type)]
-
-
-def _text(cell: object) -> str:
-    return "" if cell is None or (isinstance(cell, float) and math.isnan(cell)) else str(cell)

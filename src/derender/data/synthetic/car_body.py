@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from derender.data.synthetic.decals import DECAL_LENGTH, Paint
-from derender.data.synthetic.mesh_image import TriangleMesh, grid_triangles
+from derender.data.synthetic.mesh_image import TriangleMesh, grid_triangles, unit
 
 PARTS = ("background", "body", "window", "wheel", "light", "trim", "plate")
 ARCH = 1.13  # radius of the wheel arches in wheel radii
@@ -144,10 +144,6 @@ def smooth_grid(points: Float[ndarray, "r c 3"], chart: Float[ndarray, "r c 2"],
     return Grid(points, np.moveaxis(normals, 0, -1), chart, surface)
 
 
-def _unit(vectors: ndarray) -> ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
 def rounded_box(
     centre: Sequence[float],
     half: Sequence[float],
@@ -162,7 +158,7 @@ def rounded_box(
     sizes, rim = np.asarray(half, float), _box_faces()
     core = sizes - min(radius, *half)
     flat = np.where(np.abs(rim) > 0.4, np.sign(rim) * core, 0.0)
-    outward = _unit(np.where(np.abs(rim) > 0.9, np.sign(rim), 0.0))
+    outward = unit(np.where(np.abs(rim) > 0.9, np.sign(rim), 0.0))
     cos, sin = np.cos(lean_rad), np.sin(lean_rad)
     turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     points = (flat + (sizes - core).min() * outward) @ turn.T + np.asarray(centre, float)
@@ -195,7 +191,7 @@ def wheel(
     chart = np.stack([share * np.cos(_TURN), share * np.sin(_TURN)], axis=-1)
     local = (-side, up, axle) if backwards else (axle, up, side)
     grid = smooth_grid(np.stack(local, axis=-1) + np.asarray(centre, float), chart, surface)
-    grid.normals[:, 0] = grid.normals[:, -1] = _unit(grid.normals[:, 0] + grid.normals[:, -1])
+    grid.normals[:, 0] = grid.normals[:, -1] = unit(grid.normals[:, 0] + grid.normals[:, -1])
     return grid
 
 

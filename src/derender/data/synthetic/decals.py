@@ -3,7 +3,7 @@
 Numba's cache on disk refers to named tuples by name: who renames one renames the kernels that take it.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -44,7 +44,6 @@ NO_PAINT = Paint(
 
 
 @kernel
-@no_type_check
 def paint_samples(paint, surface, spot, inside, colour, part):
     """Fill in colour and part of a pixel's samples, surface by surface."""
     current = -1
@@ -77,7 +76,6 @@ def paint_samples(paint, surface, spot, inside, colour, part):
 
 
 @kernel
-@no_type_check
 def _cover(decal, spot, inside):
     """Which of a pixel's samples a shape holds."""
     kind = np.uint32(decal[0])

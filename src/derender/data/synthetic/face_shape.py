@@ -20,7 +20,7 @@ from jaxtyping import Float, Int32
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
-from derender.data.synthetic.mesh_image import grid_triangles
+from derender.data.synthetic.mesh_image import grid_triangles, unit
 from derender.data.synthetic.settings import numbers_of
 
 THETA_MAX = np.deg2rad(112.0)
@@ -31,10 +31,7 @@ EYE_P, EYE_Q = 12.2, -14.0
 _HEAD_RADIUS = 26.0
 _EAR_PLANE = 30.0  # z of the widest section
 _TOO_LITTLE = 0.002  # face pixels
-ACTIONS = (
-    *("jaw_open", "lips_part", "smile", "cheek_raise", "frown", "stretch", "sneer", "press"),
-    *("brow_inner_up", "brow_outer_up", "brow_lower"),
-)
+ACTIONS = tuple(numbers_of("faces")["actions"])
 LID_ACTIONS = ("wide", "squint")  # drawn with the eyes
 
 
@@ -53,24 +50,17 @@ class FaceGrid:
 
 @dataclass(frozen=True)
 class FaceShape:
-    """A linear family of surfaces (rows, columns, 3) in face pixels.
-
-    Attributes:
-        grid, triangles: the domain, and the mesh of its vertices row by row.
-        outward: unit vectors out of the bare head, level below the ears, where hair hangs.
-        names, modes: one displacement per trait of shape.
-        actions: the left and the right half of each of ``ACTIONS``: displacement, and the rows and columns
-            that it moves.
-    """
+    """A linear family of surfaces (rows, columns, 3) in face pixels."""
 
     grid: FaceGrid
-    triangles: Int32[ndarray, "f 3"]
+    triangles: Int32[ndarray, "f 3"]  # of the grid's vertices row by row
     mean: Float[ndarray, "rows columns 3"]  # the mean head without ears; symmetric
     ear: Float[ndarray, "rows columns 3"]  # displacement by ears, kept apart because hair may cover them
-    outward: Float[ndarray, "rows columns 3"]
+    outward: Float[ndarray, "rows columns 3"]  # out of the bare head, level below the ears, where hair hangs
     reach: Float[ndarray, "rows 1"]  # half width of the bare head
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the modes: one displacement per trait of shape
     modes: Float[ndarray, "modes rows columns 3"]
+    # left and right half of each of ``ACTIONS``: displacement, and the rows and columns that it moves
     actions: list[tuple[ndarray, tuple[slice, slice]]]
 
 
@@ -89,7 +79,7 @@ def face_shape(detail: float = 1.0) -> FaceShape:
             box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
             actions.append(((half * moved)[box].astype(np.float32), box))
     modes = [_displacement(grid, fields, terms) for terms in numbers["modes"].values()]
-    normal = _unit(np.cross(np.gradient(head, axis=0), np.gradient(head, axis=1)))
+    normal = unit(np.cross(np.gradient(head, axis=0), np.gradient(head, axis=1)))
     level = np.stack([np.sin(grid.theta), np.zeros(grid.p.shape), -np.cos(grid.theta)], axis=-1)
     low = smoothstep(2.0, 20.0, grid.q)[..., None]
     return FaceShape(
@@ -97,7 +87,7 @@ def face_shape(detail: float = 1.0) -> FaceShape:
         grid_triangles(*grid.p.shape),
         mean=_mean_head(grid, head).astype(np.float32),
         ear=_ear(grid).astype(np.float32),
-        outward=_unit((1.0 - low) * normal + low * level).astype(np.float32),
+        outward=unit((1.0 - low) * normal + low * level).astype(np.float32),
         reach=np.abs(head[..., 0]).max(axis=1, keepdims=True).astype(np.float32),
         names=tuple(numbers["modes"]),
         modes=np.array(modes, np.float32),
@@ -138,10 +128,6 @@ def _spaced(fine: ndarray, density: ndarray, count: int) -> ndarray:
     """``count`` increasing values over the same range, locally as close together as ``density``."""
     mass = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
     return np.interp(np.linspace(0.0, mass[-1], count), mass, fine)
-
-
-def _unit(vectors: ndarray) -> ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def _displacement(grid: FaceGrid, fields: dict[str, ndarray], terms: list[list[Any]]) -> ndarray:

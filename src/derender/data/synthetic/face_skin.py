@@ -61,14 +61,12 @@ class HairStyle(NamedTuple):
 
 
 class Skin(NamedTuple):
-    """One person's surface. ``albedo`` is (3, rows, columns) 0..1. ``thickness`` of hair and clothes and how
-    far hair hangs ``forward`` are (rows, columns) in face pixels. ``parts`` are numbers into MASK_CLASSES.
-    """
+    """One person's surface."""
 
-    albedo: Float32[ndarray, "3 rows columns"]
-    thickness: Float32[ndarray, "rows columns"]
-    forward: Float32[ndarray, "rows columns"]
-    parts: ndarray
+    albedo: Float32[ndarray, "3 rows columns"]  # 0..1
+    thickness: Float32[ndarray, "rows columns"]  # of hair and clothes, face pixels
+    forward: Float32[ndarray, "rows columns"]  # how far hair hangs forward, face pixels
+    parts: ndarray  # numbers into MASK_CLASSES
 
 
 def hair_style(who: Identity) -> HairStyle:
@@ -142,11 +140,8 @@ def _waves(
     longest: float,
     along: float | None = None,
 ) -> ndarray:
-    """A smooth zero-mean field of unit variance: ``count`` plane waves with wavelengths in the given range
-    (face pixels).
-
-    With ``along`` the waves run sideways only, mirrored, and bend slowly over that length, like strands.
-    """
+    """A smooth zero-mean field of unit variance: ``count`` plane waves of such wavelengths (face pixels).
+    With ``along`` they run sideways only, mirrored, and bend slowly over that length, like strands."""
     total = np.zeros(grid.p.shape)
     for _ in range(count):
         number = 2.0 * np.pi / generator.uniform(shortest, longest)

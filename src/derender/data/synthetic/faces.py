@@ -8,6 +8,7 @@ Conventions are those of docs/reference/conventions.md; nose tips of neutral fac
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from derender.data.synthetic.face_skin import (
     skin_fields,
 )
 from derender.data.synthetic.mesh_image import TriangleMesh
-from derender.data.synthetic.morphable import NOSE_TIP_Z, MorphableFaces
+from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshesOf, MorphableFaces
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
 
@@ -62,11 +63,11 @@ def generate(
 
     def shots(indices: list[int]) -> Iterator[Shot]:
         number = settings.first_identity + indices[0] // settings.per_identity
-        person = family.person(seed, number, settings)
+        meshes_of, known, traits = family.person(seed, number, settings)
         draws = [draw_face(seed, index, image_size, settings) for index in indices]
-        meshes = person.meshes([expression for expression, *_ in draws])
+        meshes = meshes_of([expression for expression, *_ in draws])
         for mesh, (_, background, light, camera, labels) in zip(meshes, draws, strict=True):
-            yield Shot(mesh, background, light, camera, number, labels | person.labels, person.traits)
+            yield Shot(mesh, background, light, camera, number, labels | known, traits)
 
     size = settings.per_identity
     return make_set(shots, count, image_size, seed, first, size, MASK_CLASSES, progress, settings.effects)
@@ -133,50 +134,14 @@ def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
 
 
 @dataclass(frozen=True)
-class Person:
-    """One identity of the built-in faces: its neutral surface (face pixels), nose tip, and skin."""
-
-    who: Identity
-    shape: FaceShape
-    surface: Float32[ndarray, "rows columns 3"]
-    nose_tip: float
-    skin: Skin
-    traits: Row
-    labels: Row
-
-    def meshes(self, expressions: list[Expression]) -> list[TriangleMesh]:
-        """The face with each expression, in scene units; eyes and mouths are painted as it shows them."""
-        grid, scale, count = self.shape.grid, np.float32(self.who["scale"]), len(expressions)
-        surfaces, albedo, parts = (
-            np.repeat(each[None], count, axis=0) for each in (self.surface, self.skin.albedo, self.skin.parts)
-        )
-        sides = np.stack([expression.sides for expression in expressions])
-        for n, a, side in np.argwhere(sides[:, : len(ACTIONS)]):
-            displacement, box = self.shape.actions[2 * a + side]
-            surfaces[n][box] += sides[n, a, side] * scale * displacement
-        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
-        gap = (surfaces[:, bottom, :, 1] - surfaces[:, top - 1, :, 1]) / scale
-        paint_mouth(albedo, parts, grid, self.who, gap)
-        gaze = np.stack([expression.gaze for expression in expressions])
-        paint_eyes(albedo, parts, grid, self.who, sides[:, len(ACTIONS) :], gaze)
-        surfaces += np.array([0.0, _DOWN_PX, -self.nose_tip], np.float32)
-        surfaces *= np.float32(FACE_PX)
-        surfaces[..., 2] += np.float32(NOSE_TIP_Z)
-        surfaces[..., 2] -= 1.0
-        colours = np.ascontiguousarray(albedo.reshape(count, 3, -1).transpose(0, 2, 1))
-        vertices, parts = surfaces.reshape(count, -1, 3), parts.reshape(count, -1)
-        return [TriangleMesh(vertices[n], self.shape.triangles, colours[n], parts[n]) for n in range(count)]
-
-
-@dataclass(frozen=True)
 class ProceduralFaces:
     """The built-in faces; a user's own morphable model has the same method."""
 
     shape: FaceShape
     fields: dict[str, ndarray]
 
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> Person:
-        """One identity; a function of seed, number and the settings' ranges of age and skin tone."""
+    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshesOf, Row, Row]:
+        """One identity: its meshes by expressions, its labels, and its traits for tables."""
         shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
         who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
         skin = paint_skin(who, shape, self.fields)
@@ -192,4 +157,34 @@ class ProceduralFaces:
         labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
         labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
         surface *= np.float32(who["scale"])
-        return Person(who, shape, surface, tip, skin, identity_columns(who), labels)
+        return partial(self._meshes, who, surface, tip, skin), labels, identity_columns(who)
+
+    def _meshes(
+        self,
+        who: Identity,
+        surface: Float32[ndarray, "rows columns 3"],
+        nose_tip: float,
+        skin: Skin,
+        expressions: list[Expression],
+    ) -> list[TriangleMesh]:
+        """A neutral surface (face pixels) with each expression, in scene units; eyes and mouths painted."""
+        grid, scale, count = self.shape.grid, np.float32(who["scale"]), len(expressions)
+        surfaces, albedo, parts = (
+            np.repeat(each[None], count, axis=0) for each in (surface, skin.albedo, skin.parts)
+        )
+        sides = np.stack([expression.sides for expression in expressions])
+        for n, a, side in np.argwhere(sides[:, : len(ACTIONS)]):
+            displacement, box = self.shape.actions[2 * a + side]
+            surfaces[n][box] += sides[n, a, side] * scale * displacement
+        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
+        gap = (surfaces[:, bottom, :, 1] - surfaces[:, top - 1, :, 1]) / scale
+        paint_mouth(albedo, parts, grid, who, gap)
+        gaze = np.stack([expression.gaze for expression in expressions])
+        paint_eyes(albedo, parts, grid, who, sides[:, len(ACTIONS) :], gaze)
+        surfaces += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
+        surfaces *= np.float32(FACE_PX)
+        surfaces[..., 2] += np.float32(NOSE_TIP_Z)
+        surfaces[..., 2] -= 1.0
+        colours = np.ascontiguousarray(albedo.reshape(count, 3, -1).transpose(0, 2, 1))
+        vertices, parts = surfaces.reshape(count, -1, 3), parts.reshape(count, -1)
+        return [TriangleMesh(vertices[n], self.shape.triangles, colours[n], parts[n]) for n in range(count)]

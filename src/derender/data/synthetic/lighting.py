@@ -6,7 +6,7 @@ seen. A shadow map for each lamp is drawn by the same z-buffer, four times as fi
 edge is averaged over 2 x 2 texels. Leaves out light reflected from one part onto another.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -37,14 +37,12 @@ class Lighting(NamedTuple):
 
 
 @kernel
-@no_type_check
 def is_plain(lighting):
     more = len(lighting.lamps) > 1 or len(lighting.maps) > 0
     return not (more or lighting.gloss[0] > _ZERO or lighting.haze[0] > _ZERO)
 
 
 @kernel
-@no_type_check
 def depths_seen(nearest):
     """The least and the greatest depth in a buffer of 1 / z; equal where it is empty."""
     near, far = _ZERO, np.float32(np.inf)
@@ -55,7 +53,6 @@ def depths_seen(nearest):
 
 
 @kernel
-@no_type_check
 def light_at(lighting, place, normal, span, found):
     """Light on a point with an inward normal: fills ``found`` in the order of ``EFFECTS``.
 
@@ -88,7 +85,6 @@ def light_at(lighting, place, normal, span, found):
 
 
 @kernel
-@no_type_check
 def _lit(lighting, number, cosine, x, y, z):
     """The share of the lamp that reaches a point: of the four texels around it, weighted bilinearly."""
     x, y, z = x - lighting.centre[0], y - lighting.centre[1], z - lighting.centre[2]

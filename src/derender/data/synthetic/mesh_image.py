@@ -8,7 +8,7 @@ to the named tuples by name: who renames one renames the kernels that take it.
 """
 
 from functools import lru_cache
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -63,8 +63,12 @@ def grid_triangles(rows: int, columns: int, mirrored: float = 0.0) -> Int32[ndar
     return np.stack([*first, *second], axis=-1).reshape(-1, 3).astype(np.int32)
 
 
+def unit(vectors: ndarray) -> ndarray:
+    """The vectors along the last axis at length 1; 0 stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
 @kernel
-@no_type_check
 def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
     """Fill ``out``. The mesh is turned by rotation (3,3) and moved to (0, 0, 1) + translation (3,). Light is
     a ``Lighting``, background (S,S,3) 0..1.
@@ -81,7 +85,6 @@ def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
 
 
 @kernel
-@no_type_check
 def _turned(rotation, x, y, z):
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
@@ -91,13 +94,11 @@ def _turned(rotation, x, y, z):
 
 
 @kernel
-@no_type_check
 def _corners(triangles, f):
     return np.uint32(triangles[f, 0]), np.uint32(triangles[f, 1]), np.uint32(triangles[f, 2])
 
 
 @kernel
-@no_type_check
 def _place(mesh, rotation, translation, focal_px, size, light, places, more):
     """Project vertices, and bring normals to the camera frame: the mesh's own, or means of its triangles'."""
     samples, middle = np.float32(SAMPLES), np.float32(0.5) * np.float32(size - 1)
@@ -135,7 +136,6 @@ def _place(mesh, rotation, translation, focal_px, size, light, places, more):
 
 
 @kernel
-@no_type_check
 def fill_triangles(places, triangles, number, more, holes, nearest, owner):
     """Enter triangles into ``nearest`` (1 / z, larger is nearer, 0 is empty) and ``owner`` (their numbers).
 
@@ -184,7 +184,6 @@ def fill_triangles(places, triangles, number, more, holes, nearest, owner):
 
 
 @kernel
-@no_type_check
 def _edge(ax, ay, bx, by):
     """The upper end of an edge, and by how much the edge moves to the right in each row."""
     x, y = (ax, ay) if ay < by else (bx, by)
@@ -192,13 +191,11 @@ def _edge(ax, ay, bx, by):
 
 
 @kernel
-@no_type_check
 def _crossing(edge, row):
     return edge[0] + (row - edge[1]) * edge[2]
 
 
 @kernel
-@no_type_check
 def _in_hole(places, more, a, b, c, u, v, holes, k):
     wa, wb, wc = _weights(places, a, b, c, np.float32(u), np.float32(v))
     inside = False
@@ -210,7 +207,6 @@ def _in_hole(places, more, a, b, c, u, v, holes, k):
 
 
 @kernel
-@no_type_check
 def _weights(places, a, b, c, column, row):
     """Weights of a triangle's corners at a sample, with perspective."""
     ax, ay = places[a, 0] - column, places[a, 1] - row
@@ -224,13 +220,11 @@ def _weights(places, a, b, c, column, row):
 
 
 @kernel
-@no_type_check
 def _blend(more, k, a, b, c, wa, wb, wc):
     return wa * more[a, k] + wb * more[b, k] + wc * more[c, k]
 
 
 @kernel
-@no_type_check
 def _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out):
     painted, share, scale = mesh.values.shape[1] == 2, np.float32(1.0 / _ALL), _ONE
     weight = np.empty((_ALL, 3), np.float32)  # of the corners of each sample's triangle
@@ -311,7 +305,6 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
 
 
 @kernel
-@no_type_check
 def _store(target, i, j, colour):
     """A colour of 0..1 as rounded bytes of pixel (i, j) of ``target`` (3,S,S)."""
     for n in range(3):

@@ -9,6 +9,7 @@ colour of NaN is none. Eyes do not look around and lids do not move unless the e
 import struct
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,33 +27,11 @@ from derender.data.synthetic.synthetic_set import Row
 NOSE_TIP_Z = 0.947  # of neutral faces
 _PICTURE_WIDTH = 2.0 * float(np.tan(np.deg2rad(5.0)))  # scene units across the image at z = 1
 _LIMIT = 2.5
-_REQUIRED = ("mean", "triangles", "components", "std")
+MeshesOf = Callable[[list[Any]], list[TriangleMesh]]
 _DAMAGED = (
     *(OSError, ValueError, AttributeError, LookupError, EOFError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
-
-
-@dataclass(frozen=True)
-class MorphablePerson:
-    """One identity: canonical surface in scene units about (0, 0, 1), albedo, and rows for the tables."""
-
-    family: "MorphableFaces"
-    surface: Float32[ndarray, "v 3"]
-    albedo: Float32[ndarray, "v 3"]
-    labels: Row
-    traits: Row
-
-    def meshes(self, expressions: list[Any]) -> list[TriangleMesh]:
-        """The face with each expression: its ``name`` and ``strength``."""
-        known, still = self.family.expressions, np.zeros(3, np.float32)
-        return [
-            TriangleMesh(
-                self.surface + np.float32(each.strength) * known.get(each.name, still),
-                *(self.family.triangles, self.albedo, self.family.parts),
-            )
-            for each in expressions
-        ]
 
 
 @dataclass(frozen=True)
@@ -87,8 +66,9 @@ class MorphableFaces:
         except ValueError as problem:
             raise ValueError(f"{path}: {problem}") from problem
 
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> MorphablePerson:
-        """One identity: coefficients from normals clipped at 2.5 sd."""
+    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshesOf, Row, Row]:
+        """One identity, its coefficients from normals clipped at 2.5 sd: meshes by expressions (of a ``name``
+        and ``strength``), labels, and traits for tables."""
         generator = np.random.default_rng([seed, 2, identity])
         normal = np.clip(generator.standard_normal(len(self.std)), -_LIMIT, _LIMIT)
         coefficients = (normal * self.std).astype(np.float32)
@@ -102,11 +82,17 @@ class MorphableFaces:
         albedo = np.clip(np.where(own, self.colours, albedo), 0.0, 1.0)
         labels: Row = {} if self.texture_mean is not None else {"skin_tone": round(who["melanin"], 4)}
         traits: Row = {f"shape_{k:03d}": float(value) for k, value in enumerate(coefficients)}
-        return MorphablePerson(self, surface, albedo, labels, traits)
+        known, still = self.expressions, np.zeros(3, np.float32)
+
+        def meshes(expressions: list[Any]) -> list[TriangleMesh]:
+            moved = (surface + np.float32(one.strength) * known.get(one.name, still) for one in expressions)
+            return [TriangleMesh(points, self.triangles, albedo, self.parts) for points in moved]
+
+        return meshes, labels, traits
 
 
 def _checked(arrays: dict[str, ndarray]) -> MorphableFaces:
-    for name in _REQUIRED:
+    for name in ("mean", "triangles", "components", "std"):
         if name not in arrays:
             there = ", ".join(sorted(arrays)) or "none"
             raise ValueError(f"the array {name!r} is missing; there are {there}")

@@ -141,13 +141,11 @@ class ViewSettings(Settings):
 
 
 class CarViewSettings(Settings):
-    """A turntable seen from above: uniform elevation above the ground and azimuth about the car's vertical
-    axis.
+    """A turntable seen from above: uniform elevation above the ground and azimuth about the vertical axis.
 
     Azimuth 0 sees the front; above 0 the front moves to the left of the image. With ``azimuth_beyond_deg``
-    azimuth is uniform on either side, from there to the range's ends. The rotation in the image plane is
-    normal, clipped at its range's ends. So are the shifts, in scene units, right and down; one pixel of 64 is
-    0.0028. A car that a shift would move out of the image is shifted less."""
+    azimuth is uniform on either side, from there to the range's ends. Rotation in the image plane and shifts
+    are normal, clipped at their ranges' ends. A car never leaves the image by a shift."""
 
     elevation_deg: Annotated[Range, _within(0, 90)] = (25.0, 60.0)
     azimuth_deg: Angles = (-30.0, 30.0)

@@ -37,40 +37,23 @@ _NOISE_CELLS = 5
 
 @dataclass(frozen=True)
 class SyntheticSet:
-    """N square images of size S with exact truth, one sample at each pixel's centre.
+    """N square images of size S with exact truth, one sample at each pixel's centre; maps are 0 on the
+    background."""
 
-    Attributes:
-        images: shaded images over a background.
-        depth: z in camera space, 0 on the background.
-        normal: inward unit normals in the camera frame, 0 on the background.
-        albedo: reflectance as seen by the camera, 0 on the background.
-        mask: where the object is.
-        parts: which part of the object is seen, a number into ``part_names``; 0 on the background.
-        light: ambient, diffuse, pitch, yaw (radians, canonical frame).
-        camera: rotation x, y, z (radians, about (0, 0, 1)), translation x, y, z.
-        identity: number of the person or model.
-        labels: what else is known of each image, by column name (expression, age, ...): text or numbers.
-        identity_traits: the traits drawn for each image's identity, by name.
-        part_names: names of the parts, background first.
-        fov_deg: field of view of every image.
-        effects: with effects, further maps by name, 0 on the background: ``shading`` (all diffuse light),
-            ``visible`` (share of the first lamp's light that arrives), ``highlight`` and ``transmission``.
-    """
-
-    images: UInt8[ndarray, "n 3 s s"]
-    depth: Float32[ndarray, "n s s"]
-    normal: Float32[ndarray, "n s s 3"]
-    albedo: UInt8[ndarray, "n 3 s s"]
-    mask: Bool[ndarray, "n s s"]
-    parts: UInt8[ndarray, "n s s"]
-    light: Float32[ndarray, "n 4"]
-    camera: Float32[ndarray, "n 6"]
-    identity: Int64[ndarray, "n"]
-    labels: Mapping[str, Shaped[ndarray, "n"]]
-    identity_traits: Mapping[str, Shaped[ndarray, "n"]]
-    part_names: tuple[str, ...]
-    fov_deg: float = FOV_DEG
-    effects: Mapping[str, Float32[ndarray, "n s s"]] = field(default_factory=dict)
+    images: UInt8[ndarray, "n 3 s s"]  # shaded, over a background
+    depth: Float32[ndarray, "n s s"]  # z in camera space
+    normal: Float32[ndarray, "n s s 3"]  # inward unit normals in the camera frame
+    albedo: UInt8[ndarray, "n 3 s s"]  # reflectance as seen by the camera
+    mask: Bool[ndarray, "n s s"]  # where the object is
+    parts: UInt8[ndarray, "n s s"]  # which part of the object is seen, a number into ``part_names``
+    light: Float32[ndarray, "n 4"]  # ambient, diffuse, pitch, yaw (radians, canonical frame)
+    camera: Float32[ndarray, "n 6"]  # rotation x, y, z (radians, about (0, 0, 1)), translation x, y, z
+    identity: Int64[ndarray, "n"]  # number of the person or model
+    labels: Mapping[str, Shaped[ndarray, "n"]]  # expression, age, ... of each image: text or numbers
+    identity_traits: Mapping[str, Shaped[ndarray, "n"]]  # drawn for each image's identity
+    part_names: tuple[str, ...]  # background first
+    fov_deg: float = FOV_DEG  # field of view of every image
+    effects: Mapping[str, Float32[ndarray, "n s s"]] = field(default_factory=dict)  # maps of ``EFFECTS``
 
     def __len__(self) -> int:
         return len(self.images)
@@ -113,8 +96,7 @@ def make_set(
     progress: Progress | None,
     effects: EffectSettings,
 ) -> SyntheticSet:
-    """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are those of images of one
-    object.
+    """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are some of one object.
 
     Raises:
         ValueError: a number that no set can have.
@@ -211,11 +193,30 @@ def write(
     require_empty(folder := Path(folder))
     files, maps = [f"images/{i:06d}.jpg" for i in range(len(synthetic))], (*_MAPS, *synthetic.effects)
     if "track" in synthetic.labels:
-        numbers = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
-        files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in numbers]
+        shown = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
+        files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in shown]
         truth = False
     with atomic_folder(folder) as temporary:
-        _fill(temporary, synthetic, files, maps if truth else (), progress)
+        for parent in {Path(file).parent for file in files} | set(map(Path, maps if truth else ())):
+            (temporary / parent).mkdir(parents=True, exist_ok=True)
+
+        def save(i: int) -> None:
+            picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
+            picture.save(temporary / files[i], quality=92, subsampling=0)
+            for name, pixels in _encoded(synthetic, i).items() if truth else ():
+                Image.fromarray(pixels).save(temporary / name / f"{i:06d}.png", compress_level=1)
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            for done, _ in enumerate(pool.map(save, range(len(files))), 1):
+                if progress is not None:
+                    progress(done, len(files))
+        if truth:
+            names = "\n".join(synthetic.part_names)
+            (temporary / "classes.txt").write_text(names + "\n", encoding="utf-8")
+        numbers, rows = np.unique(synthetic.identity, return_index=True)
+        traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
+        _write_table(temporary / "params.csv", {"file": files, **_parameters(synthetic)})
+        _write_table(temporary / "identities.csv", {"identity": _texts(numbers), **traits})
     return folder
 
 
@@ -223,30 +224,6 @@ def require_empty(folder: Path) -> None:
     """Raise FileExistsError unless the folder is empty or missing."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is not empty: choose another folder")
-
-
-def _fill(
-    folder: Path, synthetic: SyntheticSet, files: list[str], maps: tuple[str, ...], progress: Progress | None
-) -> None:
-    for parent in {(folder / file).parent for file in files} | {folder / name for name in maps}:
-        parent.mkdir(parents=True, exist_ok=True)
-
-    def save(i: int) -> None:
-        picture = Image.fromarray(synthetic.images[i].transpose(1, 2, 0))
-        picture.save(folder / files[i], quality=92, subsampling=0)
-        for name, pixels in _encoded(synthetic, i).items() if maps else ():
-            Image.fromarray(pixels).save(folder / name / f"{i:06d}.png", compress_level=1)
-
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for done, _ in enumerate(pool.map(save, range(len(files))), 1):
-            if progress is not None:
-                progress(done, len(files))
-    if maps:
-        (folder / "classes.txt").write_text("\n".join(synthetic.part_names) + "\n", encoding="utf-8")
-    numbers, rows = np.unique(synthetic.identity, return_index=True)
-    traits = {name: _texts(values[rows], 5) for name, values in synthetic.identity_traits.items()}
-    _write_table(folder / "params.csv", {"file": files, **_parameters(synthetic)})
-    _write_table(folder / "identities.csv", {"identity": _texts(numbers), **traits})
 
 
 def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:

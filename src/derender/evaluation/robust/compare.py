@@ -151,8 +151,9 @@ def robustness(
         if len(rows) == 1:
             single = [one for one in table.factors if one != joined]
             rows += [FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
-    learn_from = trial.pictures.select(trial.learned)
-    rows += control_rows(trial.pictures, first.settings, how, fit_on=learn_from)
+    learned_from = np.unique(np.concatenate([curve.learn for curve in trial.curves]))
+    fit_on = trial.pictures.select(learned_from)
+    rows += control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
     found = compare_robustness(
         {row.name: row.arrays() for row in rows}, trial, how.seeds(seeds),
         controls=[row.name for row in rows if row.control], head=head, resample_count=how.resamples,

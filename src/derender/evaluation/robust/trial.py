@@ -169,11 +169,6 @@ class Trial:
         files = tuple(f"{row:06d}" for row in range(len(self.images)))
         return ImageSet(self.images, files, source=self.how)
 
-    @property
-    def learned(self) -> np.ndarray:
-        """Training rows of any curve."""
-        return np.unique(np.concatenate([curve.learn for curve in self.curves]))
-
 
 def stacked_trial(
     images: np.ndarray,

@@ -119,16 +119,11 @@ class SegmentationNet(nn.Module):
         decoder: UNetDecoder | None = None,
     ):
         super().__init__()
-        widths = {tuple(encoder.widths) for encoder in encoders}
-        if len(widths) != 1:
-            raise ValueError(
-                f"encoders of one net have the same widths, got {sorted(widths) or 'no encoder'}"
-            )
         self.encoders = nn.ModuleList(encoders).requires_grad_(not frozen)
         for encoder in encoders:
             encoder.to_code.requires_grad_(False)  # the code takes no part here
         if decoder is None:
-            self.decoder = UNetDecoder(widths.pop(), len(encoders), outputs)
+            self.decoder = UNetDecoder(encoders[0].widths, len(encoders), outputs)
         else:
             self.decoder = copy.deepcopy(decoder).requires_grad_(True)
             last = decoder.to_outputs

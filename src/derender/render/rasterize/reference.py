@@ -11,24 +11,12 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-NEAR_Z = 1e-3
-"""Triangles with a vertex at or before this depth are skipped."""
-
-MIN_TWICE_AREA_PX2 = 1e-5
-"""Triangles whose doubled screen area is not above this are skipped: edge-on, or a point."""
-
-MAX_COORDINATE_PX = 1e9
-"""Triangles with a vertex projected farther out are skipped (this also drops infinite ones)."""
-
-EDGE_TOLERANCE = 1e-4
-"""A barycentric weight may be this far below zero; in pixels, that part of a cell."""
-
-TIE_TOLERANCE = 1e-6
-"""Inverse depths this close (relative) count as equal; the triangle with the lowest index wins."""
-
-NO_TRIANGLE = torch.iinfo(torch.int32).max
-"""Above every index, where none has been found yet."""
-
+# Triangles are skipped that have a vertex at or before the first, a doubled screen area not above the second
+# (edge-on, or a point), or a vertex projected farther out than the third (infinite ones, too).
+NEAR_Z, MIN_TWICE_AREA_PX2, MAX_COORDINATE_PX = 1e-3, 1e-5, 1e9
+EDGE_TOLERANCE = 1e-4  # so far below zero a barycentric weight may be; in pixels, that part of a cell
+TIE_TOLERANCE = 1e-6  # inverse depths this close (relative) are equal: the lowest triangle wins
+NO_TRIANGLE = torch.iinfo(torch.int32).max  # above every index, where none has been found yet
 PAIRS_AT_ONCE = 1 << 20
 
 

@@ -11,7 +11,6 @@ or stored. Leaves out passwords: everyone who can reach the address can use the 
 import asyncio
 import errno
 import ipaddress
-import json
 import logging
 import re
 import socket
@@ -25,6 +24,7 @@ from typing import TYPE_CHECKING
 import h11
 import uvicorn
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -72,10 +72,8 @@ class Guard:
             await self.app(scope, receive, send_guarded)
             return
         status, reason = refusal
-        body = json.dumps({"error": reason}).encode()
-        kind = [(b"content-type", b"application/json"), (b"connection", b"close")]
-        await send_guarded({"type": "http.response.start", "status": status, "headers": kind})
-        await send_guarded({"type": "http.response.body", "body": body})
+        answer = JSONResponse({"error": reason}, status, headers={"connection": "close"})
+        await answer(scope, receive, send_guarded)
 
     def refusal(self, method: str, path: str, headers: Headers) -> tuple[int, str] | None:
         """Status and reason why a request is not let through, or None."""
