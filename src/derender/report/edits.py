@@ -8,6 +8,7 @@ with transparency, film.gif and film.mp4. moved.json has the numbers of every st
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from math import ceil, degrees, log10
 from pathlib import Path
@@ -55,14 +56,17 @@ class Edit:
         """Write all files; returns the content of moved.json: the record, and each still's numbers."""
         cell = min(LARGEST_CELL, max(SMALLEST_CELL, *(still.width for still in self.stills.values())))
         strip = labelled_grid({name: [one] for name, one in self.row.items()}, layout=GridLayout(cell))
-        strip.save(folder / "strip.png", compress_level=3)
         stills = []
-        for number, (label, still) in enumerate(self.stills.items(), 1):
-            name = f"still-{number:02d}.png"
-            still.save(folder / name, compress_level=3)
-            stills.append({"file": name, "label": label, **self.numbers[label]})
-        for kind in self.films if self.frames else ():
-            (folder / f"film.{kind}").write_bytes(FILMS[kind](self.frames, self.seconds))
+        with ThreadPoolExecutor() as pool:  # films are encoded while stills are
+            kinds = self.films if self.frames else ()
+            films = {kind: pool.submit(FILMS[kind], self.frames, self.seconds) for kind in kinds}
+            strip.save(folder / "strip.png", compress_level=1)
+            for number, (label, still) in enumerate(self.stills.items(), 1):
+                name = f"still-{number:02d}.png"
+                still.save(folder / name, compress_level=1)
+                stills.append({"file": name, "label": label, **self.numbers[label]})
+            for kind, film in films.items():
+                (folder / f"film.{kind}").write_bytes(film.result())
         written = {**record, "stills": stills}
         text = json.dumps(written, indent=1, ensure_ascii=False)
         (folder / "moved.json").write_text(text, encoding="utf-8")
