@@ -332,6 +332,30 @@ def true_factors(found: Any) -> Iterator[list[str]]:
         yield [name, *(f"{round(score, 2) + 0:.2f}" for score in scores)]
 
 
+def disentangled(found: Any) -> Iterator[list[str]]:
+    """Similarity between factors and the swap test, of the model and each control."""
+    columns = ("Pearson per dimension", "CKA", "cross R2", "swap test, features", "swap test, decoded")
+    yield ["", *columns]
+    for name, (row, *_) in found["rows"].items():
+        alike, swap = row["similarity"] or {}, row["swap"] or {}
+        values = [
+            (row["pearson"]["mean_per_dimension"], 3), (alike.get("mean_cka_unbiased"), 3),
+            (alike.get("mean_cross_r2"), 3), (swap.get("ratio"), 2), (swap.get("ratio_parameters"), 2),
+        ]  # fmt: skip
+        label = name if name == "model" else f"{name} (control)"
+        yield [label, *("" if value is None else f"{value:.{digits}f}" for value, digits in values)]
+
+
+def swapped(found: Any) -> Iterator[list[str]]:
+    """How far each feature moves towards its donor's where one factor was exchanged."""
+    swap = found["rows"]["model"][0]["swap"]
+    yield ["", *swap["factors"]]
+    for name, row in zip(swap["factors"], swap["moved"], strict=True):
+        yield [f"{name} exchanged", *(f"{value:.2f}" for value in row)]
+    unexchanged = (f"{value:.2f}" for value in swap["unexchanged"])
+    yield ["nothing exchanged, rendered and encoded again", *unexchanged]
+
+
 def page_speed(found: Any) -> Iterator[list[str]]:
     yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
     for row in found["rows"]:
@@ -385,6 +409,8 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "step-memory": ("step_memory.json", step_memory),
     "million": ("clustering_million.json", million),
     "true-factors": ("true-factors.json", true_factors),
+    "disentanglement-generated": ("true-factors.json", disentangled),
+    "swap-matrix-generated": ("true-factors.json", swapped),
     "bench": ("bench.json", shares),
     "compiled-step": ("compiled_step.json", compiled),
     "fitting": ("fitting.json", fitting),
