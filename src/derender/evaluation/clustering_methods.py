@@ -7,7 +7,7 @@ cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``app
 FINCH: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it), with cosine distance. Every
 row is linked to its nearest other row; the connected parts are the clusters; their means are the rows of the
 next level. A level that takes away at most one cluster, or leaves only one, ends the hierarchy, as in
-`finch-clust`, which holds several N x N arrays. Leaves out its cut of long links, which has
+`finch-clust`. That package holds several N x N arrays. Leaves out its cut of long links, which has
 no effect in it.
 
 Ward's criterion (1963) is reducible (Bruynooghe 1977): a merged pair is never nearer to a third cluster than
