@@ -15,29 +15,29 @@ def noise(seed: int, width: int = 12, height: int = 12, channels: int = 3) -> np
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
+def encode(what: int | np.ndarray | Image.Image, form: str = "PNG", **options: object) -> bytes:
+    """A small image of noise by its seed, or the given one, encoded."""
+    array = noise(what) if isinstance(what, int) else what
+    picture = array if isinstance(array, Image.Image) else Image.fromarray(array)
+    buffer = io.BytesIO()
+    picture.save(buffer, form, **options)
+    return buffer.getvalue()
+
+
 @pytest.fixture
 def encoded() -> Callable[..., bytes]:
-    """``encoded(seed)`` is a small PNG of noise; ``encoded(array, "JPEG", ...)`` encodes what is given."""
-
-    def encode(what: int | np.ndarray | Image.Image, form: str = "PNG", **options: object) -> bytes:
-        array = noise(what) if isinstance(what, int) else what
-        picture = array if isinstance(array, Image.Image) else Image.fromarray(array)
-        buffer = io.BytesIO()
-        picture.save(buffer, form, **options)
-        return buffer.getvalue()
-
     return encode
 
 
 @pytest.fixture
-def tree(tmp_path: Path, encoded) -> Callable[..., Path]:
+def tree(tmp_path: Path) -> Callable[..., Path]:
     """``tree(files, zipped)`` writes a folder or zip: each name gets its own image or what is given."""
 
     def make(
         files: list[str] | dict[str, bytes | str | None], zipped: bool = False, name: str = "set"
     ) -> Path:
         contents = dict.fromkeys(files) if isinstance(files, list) else files
-        data = {file: encoded(at) if one is None else one for at, (file, one) in enumerate(contents.items())}
+        data = {file: encode(at) if one is None else one for at, (file, one) in enumerate(contents.items())}
         if zipped:
             path = tmp_path / f"{name}.zip"
             with zipfile.ZipFile(path, "w") as archive:

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from PIL import Image
+from tests.data.conftest import encode as png
 from tests.data.conftest import noise
 
 from derender.data import MASK_CLASSES, list_images, read_ground_truth, read_images, read_masks
@@ -20,13 +21,6 @@ SIZE = 12
 ZERO = np.zeros((32, 32), np.uint8)
 
 
-def png(array: np.ndarray, mode: str | None = None) -> bytes:
-    stored = io.BytesIO()
-    image = Image.fromarray(array)
-    (image if mode is None else image.convert(mode)).save(stored, "PNG")
-    return stored.getvalue()
-
-
 def picture(seed: int, size: int = 32) -> bytes:
     return png(noise(seed, size, size))
 
@@ -35,7 +29,7 @@ def part(rows: slice, columns: slice, size: int = 16, mode: str = "L") -> bytes:
     """One part of a face as published: white on black, half the image's size."""
     mask = np.zeros((size, size), np.uint8)
     mask[rows, columns] = 255
-    return png(mask, mode)
+    return png(Image.fromarray(mask).convert(mode))
 
 
 @pytest.fixture
@@ -224,9 +218,7 @@ def test_parts_are_merged_in_the_published_order(tree, published, zipped):
 def test_merged_masks_and_palettes_are_resized_to_the_nearest_value(tree, merged):
     image = Image.frombytes("P", (32, 32), bytes([7] * 1024))
     image.putpalette([200, 10, 30] * 256)
-    stored = io.BytesIO()
-    image.save(stored, "PNG")
-    result = read_masks(tree({**merged, "images/3.jpg": picture(3), "masks/3.png": stored.getvalue()}), 16)
+    result = read_masks(tree({**merged, "images/3.jpg": picture(3), "masks/3.png": png(image)}), 16)
     assert (result.masks[3] == 7).all() and result.masks.dtype == np.uint8
     for row in range(3):
         whole = np.asarray(Image.open(io.BytesIO(merged[f"masks/{row}.png"])))
@@ -284,7 +276,7 @@ def test_official_parts_and_attributes(tree, published):
         (png(ZERO + 19), r"masks/1\.png .* the number 19; classes are 0 \(background\) to 18 \(cloth\)"),
         (png(ZERO.astype(np.uint16) + 300), "holds the number 300; classes are 0"),
         (png(np.tile(ZERO, (1, 2))), r"is 64 x 32 and its image images/1\.jpg 32 x 32: .* the aspect ratio"),
-        (png(ZERO, "RGB"), "has 3 channels; a mask has one, of class numbers"),
+        (png(Image.fromarray(ZERO).convert("RGB")), "has 3 channels; a mask has one, of class numbers"),
         (b"no image", r"masks/1\.png in .* cannot be read"),
         (png(noise(1, channels=1))[:90], r"masks/1\.png in .* cannot be read"),
     ],

@@ -122,14 +122,10 @@ def read_masks(
             square = fit_square(Image.fromarray(mask), image_size, fit, Image.Resampling.NEAREST, 0)
             found[row] = np.asarray(square)
 
-        pool = ThreadPoolExecutor(workers or usable_cores())
-        try:
-            with quiet_pillow():
-                for done, _ in enumerate(pool.map(load, range(len(images))), 1):
-                    if progress is not None:
-                        progress(done, len(images))
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with ThreadPoolExecutor(workers or usable_cores()) as pool, quiet_pillow():
+            for done, _ in enumerate(pool.map(load, range(len(images))), 1):
+                if progress is not None:
+                    progress(done, len(images))
         return MaskedImages(images, found, MASK_CLASSES if own else _class_names(files, found, names))
 
 
@@ -227,12 +223,12 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
     """The images of a set in synface64's format, in the order of their names."""
     known = set(source.files)
 
-    def map_names(kind: str, files: tuple[str, ...]) -> list[str]:
-        return [f"{file.rpartition('images/')[0]}{kind}/{stem_of(file)}.png" for file in files]
+    def map_names(kind: str) -> list[str]:
+        return [f"{file.rpartition('images/')[0]}{kind}/{stem_of(file)}.png" for file in table.files]
 
-    with_depth = [row for row, name in enumerate(map_names("depth", table.files)) if name in known][:limit]
+    with_depth = [row for row, name in enumerate(map_names("depth")) if name in known][:limit]
     if not with_depth:
-        expected = "; ".join(map_names("depth", table.files[:1]))
+        expected = "; ".join(map_names("depth")[:1])
         raise ValueError(f"{source.path} has no depth maps for its images (expected {expected})")
     table = table.select(np.array(with_depth))
     missing = [name for name in (*LIGHT, *CAMERA) if name not in table.labels]
@@ -241,8 +237,7 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
 
     def maps(kind: str, *modes: str) -> np.ndarray | None:
         """The maps of a kind as they are stored, all of one mode and size, or None where there is none."""
-        names = map_names(kind, table.files) if kind else table.files
-        arrays = []
+        names, arrays = map_names(kind) if kind else table.files, []
         if known.isdisjoint(names):
             return None
         for name in names:

@@ -143,7 +143,6 @@ STREAMED = ("webdataset", "huggingface")
 _IDENTIFIER = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _OPTIONS = ("column", "config", "revision", "half")
 _ENTRIES_LOOKED_AT = 10_000
-_HASHED_AT_ONCE = 10_000
 
 
 class ListedStream(Stream):
@@ -174,11 +173,8 @@ class ListedStream(Stream):
         """A digest of the layout, and of the name, size and checksum or time of change of every image."""
         files, boxes = self.table.files, self.table.boxes
         digest = hashlib.sha256(repr((self.layout, None if boxes is None else boxes.tobytes())).encode())
-        stamps = self.files.stamps(files)
-        for first in range(0, len(files), _HASHED_AT_ONCE):
-            some = slice(first, first + _HASHED_AT_ONCE)
-            rows = zip(files[some], stamps[some].tolist(), strict=True)
-            digest.update("".join(f"({file!r}, {stamp})" for file, stamp in rows).encode("utf-8"))
+        for file, stamp in zip(files, self.files.stamps(files).tolist(), strict=True):
+            digest.update(f"({file!r}, {stamp})".encode())
         return digest.hexdigest()
 
     def close(self) -> None:

@@ -47,16 +47,13 @@ class _Group:
 
 
 class ShardStream(Stream):
-    """Samples of one or more tar files, in order. ``column`` ("jpg", "input.png") is the image to take where
-    samples have several, ``source`` the user's address.
-    """
+    """Samples of one or more tar files, in order."""
 
     layout = "webdataset"
 
     def __init__(self, source: str, shards: list[Path], column: str | None = None):
-        self.source = source
-        self.shards = shards
-        self.column = column
+        self.source, self.shards = source, shards  # what the user named, and what it stands for
+        self.column = column  # the image to take where samples have several ("jpg", "input.png")
 
     def identity(self) -> object:
         return self.column, [str(shard.resolve()) for shard in self.shards], stamps_of(self.shards).tolist()

@@ -52,11 +52,9 @@ _MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 
 
 class _OwnersList(NamedTuple):
-    """A list's file and place, the names of its values (none where it has no such line), rows by image."""
-
-    where: str
-    columns: Sequence[str]
-    rows: Mapping[str, Sequence[str]]
+    where: str  # its file and place
+    columns: Sequence[str]  # names of its values; none where it has no such line
+    rows: Mapping[str, Sequence[str]]  # by image
 
     def numbers(self, columns: Sequence[str], names: Sequence[str]) -> Float32[np.ndarray, "n c"]:
         """These columns for the images of these names, NaN for one without a row."""
@@ -90,11 +88,11 @@ def _owners_list(
     columns = lines[head - 1].split(comma) if head else []
     if columns and (comma or columns[0] == "image_id"):
         columns = columns[1:]
-    rows = {}
+    rows, count = {}, len(columns) or 1
     for number, line in enumerate(lines[head:], head + 1):
         name, *values = line.split(comma) or [""]
-        if line and (len(values) != (len(columns) or 1) or (codes and not set(values) <= set(codes))):
-            expected = f"a name and {len(columns) or 1} values{meaning}"
+        if line and (len(values) != count or (codes and not set(values) <= set(codes))):
+            expected = f"a name and {count} values{meaning}"
             raise ValueError(f"{where}, line {number}: expected {expected}, got {line[:80]!r}")
         if line:
             rows[name] = values

@@ -130,13 +130,10 @@ def half_of(rows: T, half: str) -> T:
     if half == "all":
         return rows
     keys = list(map(stem_of, rows.files))
-    for name in HALVED_BY:
-        if name in rows.labels:
-            keys = [
-                key if value in ("", None) else str(value)
-                for value, key in zip(rows.labels[name].tolist(), keys, strict=True)
-            ]
-            break
+    owner = next((name for name in HALVED_BY if name in rows.labels), None)
+    if owner is not None:
+        owners = zip(rows.labels[owner].tolist(), keys, strict=True)
+        keys = [key if value in ("", None) else str(value) for value, key in owners]
     chosen = np.flatnonzero([in_test_half(key) == (half == "test") for key in keys])
     if len(chosen) == 0:
         raise ValueError(f"the {half} half of {len(keys):,} rows is empty: use all of them")
