@@ -160,14 +160,11 @@ def compare_clusterings(
     clusters = {name: n_clusters or size for name, size in sizes.items()}
     n_rows, once = int(labelled.sum()), np.ones((1, labelled.sum()), np.float32)
 
-    runs: dict[str, list[dict[str, np.ndarray]]] = {}
+    runs, starts = {}, range(seed, seed + (5 if method == "k-means" else 1))
     for name, arrays in features.items():
-        runs[name] = []
-        for array in arrays:
-            for one in range(seed, seed + (5 if method == "k-means" else 1)):
-                own = np.asarray(array)[labelled]
-                cuts = clusterings(own, clusters.values(), method, seed=one, memory=memory)
-                runs[name].append({label: cuts[count] for label, count in clusters.items()})
+        fits = [(np.asarray(array)[labelled], start) for array in arrays for start in starts]
+        cuts = [clusterings(own, clusters.values(), method, seed=one, memory=memory) for own, one in fits]
+        runs[name] = [{label: cut[count] for label, count in clusters.items()} for cut in cuts]
     first = next(iter(runs.values()))[0]
     runs["majority"] = [dict.fromkeys(labels, np.zeros(n_rows, np.int64))]
 
@@ -189,8 +186,8 @@ def compare_clusterings(
             for label, values in zip(labels, plain[0].tolist(), strict=True)
         }
     orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
-    deals = [{label: clustered[order] for label, clustered in first.items()} for order in orders]
-    chance = np.stack([_scorer(numbers, deal)(once)[0].mean(axis=0) for deal in deals], axis=1)
+    deals = [_scorer(numbers, {label: own[order] for label, own in first.items()}) for order in orders]
+    chance = np.stack([deal(once)[0].mean(axis=0) for deal in deals], axis=1)
     found = {score: constant(own, resample_count) for score, own in zip(METRICS, chance, strict=True)}
     rows.append(ScoredRow("chance", True, len(deals), found))
     n_missing = sum(int((values < 0).sum()) for values in numbers.values())
