@@ -208,14 +208,11 @@ def sanity_check(
     ``targets`` the label or class explained for each.
     """
     twins, found = [untrained_twin(model, seed) for seed in seeds], []
+    asked = [(model, probe), (model, shuffled), *((twin, probe) for twin in twins)]
     for method in methods:
         for factor in probe.factors:
-
-            def maps(net: Any, asked: Probe, method: str = method, factor: str = factor) -> Tensor:
-                return saliency(method, net, images, factor, asked, targets)
-
-            own = maps(model, probe)
-            fresh, learned = [maps(twin, probe) for twin in twins], maps(model, shuffled)
+            maps = (saliency(method, net, images, factor, one, targets) for net, one in asked)
+            own, learned, *fresh = maps
             for changed, others in zip(CHANGES, (fresh, [learned], [own.roll(1, dims=0)]), strict=True):
                 found.append(similarity(method, factor, changed, own, others, images.shape[-1]))
     return found
