@@ -7,11 +7,11 @@ installed with derender: those are in benchmarks/.
 
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -63,7 +63,9 @@ def bench(
 
 def measured(pair: SpeedPair, rounds: int) -> dict[str, Any]:
     """Both in turns, after a round to warm up: medians of speed, and of the ratio least and most."""
-    speeds = [[pair.count / _seconds(work) for work in (pair.ours, pair.theirs)] for _ in range(rounds + 1)]
+    speeds = [
+        [pair.count / timeit(work, number=1) for work in (pair.ours, pair.theirs)] for _ in range(rounds + 1)
+    ]
     ratios = [ours / theirs for ours, theirs in speeds[1:]]
     ours, theirs = (statistics.median(column) for column in zip(*speeds[1:], strict=True))
     facts = {"what": pair.what, "unit": pair.unit, "ours_per_second": ours, "theirs_per_second": theirs}
@@ -126,11 +128,11 @@ def waiting_share(quick: bool) -> dict[str, float]:
         file.write_bytes(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8).tobytes())
         images = torch.from_numpy(np.memmap(file, np.uint8, mode="c", shape=shape))
         batches = Batches(images, batch, seed=0, horizontal_flips=True)
-        unaided = sum(_seconds(partial(batches.read, position)) for position in range(steps))
+        unaided = sum(timeit(partial(batches.read, position), number=1) for position in range(steps))
         reader = Reader(batches)
         step(reader.at(0))
         before = reader.waited_s
-        took = sum(_seconds(lambda at=at: step(reader.at(at))) for at in range(1, steps))
+        took = sum(timeit(lambda at=at: step(reader.at(at)), number=1) for at in range(1, steps))
         waited = reader.waited_s - before
         reader.close()
         del images, batches, reader  # the file stays mapped as long as one of them lives
@@ -158,9 +160,3 @@ def _training() -> tuple[Any, Callable[[Any], None]]:
         model.zero_grad(set_to_none=True)
 
     return model, step
-
-
-def _seconds(work: Callable[[], Any]) -> float:
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began

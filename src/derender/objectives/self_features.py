@@ -110,7 +110,6 @@ def train_self_features(
     seed: int,
     steps: int,
     progress: Callable[[int, int, float], None] | None = None,
-    device: torch.device | str = "cpu",
     settings: SelfTraining = SelfTraining(),
 ) -> SelfFeatures:
     """Train on these images and freeze; ``progress(step, steps, loss)`` is called after every step.
@@ -123,7 +122,7 @@ def train_self_features(
     if steps < 1:
         raise ValueError(f"training perceptual features needs at least 1 step, got {steps}")
     generator = Generator().manual_seed(seed)
-    net, width = SelfFeatures(settings.widths).to(device), settings.widths[-1]
+    net, width = SelfFeatures(settings.widths).to(images.device), settings.widths[-1]
     head = nn.Sequential(
         nn.Conv2d(width, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, settings.projection, 1)
     )
@@ -133,13 +132,13 @@ def train_self_features(
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu", generator=generator)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
-    learner = nn.Sequential(layers, head).to(device).train()
+    learner = nn.Sequential(layers, head).to(images.device).train()
     optimiser = torch.optim.AdamW(
         learner.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
     )
 
     def loss(rows: Int64[Tensor, " b"]) -> Tensor:
-        crops = images[rows].to(device).float() / 255
+        crops = images[rows].float() / 255
         pair = two_views(crops, settings.crop, SelfFeatures.stride, settings.places, generator)
         views = (torch.cat([pair.first, pair.second]) - net.image_mean) / net.image_std
         first, second = learner(views.contiguous(memory_format=torch.channels_last)).chunk(2)
@@ -156,7 +155,7 @@ def train_self_features(
         )
     net.features.load_state_dict(without_normalisation(layers.cpu().eval(), settings.widths).state_dict())
     rows = torch.randperm(len(images), generator=generator)[:CALIBRATION_IMAGES]
-    net.calibrate_(images[rows].to(device).float() / 255)
+    net.calibrate_(images[rows].float() / 255)
     return net
 
 

@@ -161,9 +161,8 @@ def self_features_of(
                 f"{problem}: they are learnt again, from the same seed", DamageNoticed, stacklevel=2
             )
     features = train_self_features(
-        images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total),
-        device=images.device,
-    )  # fmt: skip
+        images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total)
+    )
     features.save(file)
     return features
 

@@ -180,12 +180,9 @@ def make_fitting(
 ) -> Fitting:  # fmt: skip
     """The morphable model of a model's predicted maps, and the length of features made of fitted scenes.
 
-    Arguments are those of `make_features`. Fewer than two images, maps that are NaN or infinite, or a model
-    without geometry and albedo are a ValueError.
+    Arguments are those of `make_features`, of a model with geometry and albedo. Fewer than two images, and
+    maps that are NaN or infinite, are a ValueError.
     """
-    missing = sorted(set(PARAMETERS) - {factor.name for factor in model.factors})
-    if missing:
-        raise ValueError(f"fitting needs the factors {', '.join(PARAMETERS)}; this model has no {missing[0]}")
     rows = torch.randperm(len(images), generator=Generator().manual_seed(seed))[: settings.examples]
     if len(rows) < 2:
         raise ValueError(f"fitting needs at least 2 images, got {len(rows)}")
