@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -107,6 +108,12 @@ def test_damaged_and_foreign_folders_are_named(runs, copy, tmp_path):
         load_baseline(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"holds the baseline 'ae'.*--baseline ae"):
         derender.load(runs / "ae")
+
+
+def test_a_missing_package_is_not_taken_for_damage(runs, monkeypatch):
+    monkeypatch.setitem(sys.modules, "vector_quantize_pytorch", None)
+    with pytest.raises(ValueError, match=r"^the baseline vqvae needs the package vector_quantize_pytorch"):
+        load_baseline(runs / "vqvae")
 
 
 def test_a_run_of_one_kind_is_not_taken_for_another(runs, blobs):

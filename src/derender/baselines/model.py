@@ -138,6 +138,9 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     kind = network_type(stored)
     with naming_damage(folder):
         settings = kind.settings_type.model_validate(config["settings"])
+    with torch.device("meta"):
+        kind(settings)  # a package that is missing is an error of its own
+    with naming_damage(folder):
         model: BaselineModel = read_weights(folder, lambda: kind(settings))
     return model.eval().requires_grad_(False)
 

@@ -35,13 +35,12 @@ def lambert_shadow(softness_deg: float = 5.0) -> Renderer:
 
 
 def visible(
-    depth: Float[Tensor, "n h w"], light: Float[Tensor, "n 4"], fov_deg: float, softness_deg: float = 5.0,
-    backend: str = "auto",
-) -> Float[Tensor, "n h w"]:  # fmt: skip
+    depth: Float[Tensor, "n h w"], light: Float[Tensor, "n 4"], fov_deg: float, softness_deg: float = 5.0
+) -> Float[Tensor, "n h w"]:
     """The share of the directional light that reaches each point, 0..1, with gradients to depth and light."""
     towards = -light_direction(light.to(depth.dtype))
     with torch.no_grad():
-        if chosen_backend(depth.device, backend) == "numba":
+        if chosen_backend(depth.device) == "numba":
             from derender.renderers.shadow_numba import lowest_step as search
         else:
             search = _lowest_step
