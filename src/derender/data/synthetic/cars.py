@@ -57,10 +57,7 @@ CANONICAL_ELEVATION_DEG = 42.5
 _GOLDEN = 0.6180339887498949
 _PAINT_WHITE, _PAINT_BLACK, _TYRE = (0.92, 0.92, 0.91), (0.075, 0.075, 0.08), (0.055, 0.055, 0.06)
 _BAR_BLUE, _BAR_RED = (0.05, 0.22, 0.95), (0.95, 0.05, 0.06)
-_ALONG = (
-    *("length", "front_wheel", "rear_wheel", "nose_at", "cowl_at", "screen_at"),
-    *("roof_end_at", "deck_at", "tail_at"),
-)
+_PLACES = [name for name in CarShape._fields if name.endswith("_at")]
 _UP = ("height", "nose", "cowl", "deck", "tail", "bumper")
 _PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.15}  # chance of such bumpers
 
@@ -129,7 +126,8 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
     azimuth = drawn(view.azimuth_deg, uniform[1], view.azimuth_beyond_deg)
     inplane = min(max(view.inplane_sd_deg * normal[0], view.inplane_deg[0]), view.inplane_deg[1])
     kind = settings.backgrounds[int(uniform[7] * len(settings.backgrounds))]
-    rotation = view_rotation(elevation, azimuth, inplane) @ about_x(CANONICAL_ELEVATION_DEG).T
+    turn = Rotation.from_euler("ZXY", [inplane, elevation, azimuth], degrees=True).as_matrix()
+    rotation = turn @ about_x(CANONICAL_ELEVATION_DEG).T
     x, y, z = rotation @ car.mesh.vertices.T
     reach = np.tan(np.deg2rad(FOV_DEG / 2)) * (z + 1.0)
     low = np.array([(-reach - x).max(), (-reach - y).max()])  # so that all vertices stay in the image
@@ -143,25 +141,15 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
         car.mesh,
         draw_background(kind, generator, image_size),
         settings.light.draw(uniform[2:7], settings.brightest),
-        np.array([*euler_angles(rotation), *shift, 0.0], np.float32),
+        np.array([*Rotation.from_matrix(rotation).as_euler("xyz"), *shift, 0.0], np.float32),  # R = Rz Ry Rx
         number,
         labels,
         car.row,
     )
 
 
-def view_rotation(elevation_deg: float, azimuth_deg: float, inplane_deg: float) -> Float64[ndarray, "3 3"]:
-    """M, from the upright car to the camera's axes."""
-    return Rotation.from_euler("ZXY", [inplane_deg, elevation_deg, azimuth_deg], degrees=True).as_matrix()
-
-
 def about_x(angle_deg: float) -> Float64[ndarray, "3 3"]:
     return Rotation.from_euler("x", angle_deg, degrees=True).as_matrix()
-
-
-def euler_angles(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, "3"]:
-    """Angles about x, y, z (radians) of R = Rz Ry Rx."""
-    return Rotation.from_matrix(rotation).as_euler("xyz")
 
 
 def draw_traits(name: str, generator: np.random.Generator) -> CarTraits:
@@ -197,7 +185,8 @@ def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> C
     row = CarShape(*numbers_of("cars")["measures"][style])
     normal = np.clip(generator.standard_normal(len(row)), -2.0, 2.0).tolist()
     factor = {name: 1.0 + 0.03 * z for name, z in zip(CarShape._fields, normal, strict=True)}
-    common = dict.fromkeys(_ALONG, factor["length"]) | dict.fromkeys(_UP, factor["height"])  # as ordered
+    along = ("length", "front_wheel", "rear_wheel", *_PLACES)
+    common = dict.fromkeys(along, factor["length"]) | dict.fromkeys(_UP, factor["height"])  # as ordered
     drawn_row = {name: value * (factor | common)[name] for name, value in row._asdict().items()}
     between = factor["cowl"] - 1.0  # a longer or shorter bonnet moves the windscreen as a whole
     drawn_row["cowl_at"] += 1.2 * between

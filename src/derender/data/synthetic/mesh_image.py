@@ -281,10 +281,8 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
                         colour[s, n] = _blend(more, 3 + n, a, b, c, wa, wb, wc)
                 found[0] = light.ambient + lamp[0] * max(_ZERO, cosine)
                 if not plain:
-                    u, v = (
-                        np.float32(j + (s % SAMPLES - 1) / SAMPLES),
-                        np.float32(i + (s // SAMPLES - 1) / SAMPLES),
-                    )
+                    u = np.float32(j + (s % SAMPLES - 1) / SAMPLES)
+                    v = np.float32(i + (s // SAMPLES - 1) / SAMPLES)
                     place = u, v, _ONE / _blend(places, 2, a, b, c, wa, wb, wc), focal_px, len(background)
                     light_at(light, place, (x * scale, y * scale, z * scale), span, found)
                 lit, shine, passed, veiled = found[0], found[2], found[3], air * (_ONE - found[3])

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy import ndarray
 from PIL import Image
 
+from derender.data.stream import Progress
 from derender.data.synthetic.lighting import EFFECTS
 from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh, lit_by
 from derender.data.synthetic.settings import EffectSettings
@@ -30,7 +31,6 @@ from derender.storage.atomic import atomic_folder
 
 FOV_DEG = 10.0
 Row = dict[str, int | float | np.float32 | str]
-Progress = Callable[[int, int], None]
 _LONGEST_RUN = 16
 _NOISE_CELLS = 5
 
