@@ -122,7 +122,7 @@ def probe_runs(
 
 
 def nearest_answers(features: np.ndarray, targets: np.ndarray, tested: np.ndarray) -> np.ndarray:
-    """Share of each value among the ten nearest training rows by cosine: (T, A), 0.5 where all are unknown."""
+    """Share of each value among the ten nearest training rows by cosine: (T, A), 0.5 if all are unknown."""
     mean = features.mean(axis=0)
     near, far = (unit_rows(np.asarray(rows, np.float64) - mean) for rows in (features, tested))
     found = np.argsort(-(far @ near.T), axis=1, kind="stable")[:, :10]
