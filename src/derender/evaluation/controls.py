@@ -98,8 +98,7 @@ def control_rows(
     fitted = images if fit_on is None else fit_on
     components = component_count(len(fitted))  # whitening needs many more rows than components
     inputs = {"images": images.images, "components": components}
-    if fit_on is not None:
-        inputs["fit_on"] = fit_on.images
+    inputs |= {} if fit_on is None else {"fit_on": fit_on.images}
     pca = options.memory.recall_one(
         "pca", inputs, lambda: pca_features(images, components=components, fit_on=fitted).factors["pca"]
     )

@@ -43,7 +43,6 @@ PROBES = {
 HEADS = ("linear", "logistic", "k-NN")
 """Asked where none are named."""
 
-NEIGHBOURS = 10
 PENALTIES = (1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
 """C for rows whose mean squared length is 1: standardised features divided by the root of their number."""
 FOLDS = 5
@@ -122,13 +121,11 @@ def probe_runs(
     return answers
 
 
-def nearest_answers(
-    features: np.ndarray, targets: np.ndarray, tested: np.ndarray, neighbours: int = NEIGHBOURS
-) -> np.ndarray:
-    """Share of each value among the nearest training rows by cosine: (T, A), 0.5 where all are unknown."""
+def nearest_answers(features: np.ndarray, targets: np.ndarray, tested: np.ndarray) -> np.ndarray:
+    """Share of each value among the ten nearest training rows by cosine: (T, A), 0.5 if all are unknown."""
     mean = features.mean(axis=0)
     near, far = (unit_rows(np.asarray(rows, np.float64) - mean) for rows in (features, tested))
-    found = np.argsort(-(far @ near.T), axis=1, kind="stable")[:, : min(neighbours, len(near))]
+    found = np.argsort(-(far @ near.T), axis=1, kind="stable")[:, :10]
     return _shares(targets[found])
 
 

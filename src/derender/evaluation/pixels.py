@@ -133,16 +133,13 @@ def evaluate_reconstruction(
         return tuple(map(torch.cat, zip(*parts, strict=True)))
 
     image, target, mask = rendered(model, progress)
-    mean, known, count = mean_image(images) if mean is None else mean, None, 0
-    if components_of is not None:
-        count = component_count(len(components_of))
-        known = reconstruction_scores(from_components(images, components_of), target, mask)
+    mean, fitted = mean_image(images) if mean is None else mean, components_of
     return ReconstructionResult(
         reconstruction_scores(image, target, mask),
         reconstruction_scores(mean.expand_as(target), target, mask),
-        known,
+        None if fitted is None else reconstruction_scores(from_components(images, fitted), target, mask),
         None if untrained is None else reconstruction_scores(*rendered(untrained)),
-        count,
+        0 if fitted is None else component_count(len(fitted)),
     )
 
 

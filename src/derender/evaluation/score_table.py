@@ -86,9 +86,6 @@ class ScoreTable:
                     f"row {row.name!r} has {len(row.cells)} cells for {len(self.columns)} columns"
                 )
 
-    def __str__(self) -> str:
-        return self.to_markdown()
-
     def numbers(self, column: int) -> list[float]:
         """Every finite number of one column."""
         return [number for row in self.rows if (number := _number(row.cells[column])) is not None]
@@ -166,6 +163,8 @@ class ScoreTable:
         table = ["| " + " | ".join(cells) + " |" for cells in lines]
         return "\n".join([self.caption, "", *table, *(["", notes] if notes else []), ""])
 
+    __str__ = to_markdown
+
     def to_latex(self) -> str:
         """A table environment; it needs ``\\usepackage{booktabs}``."""
         heads = [_latex(column.name) + LATEX_ARROWS[column.best] for column in self.columns]
@@ -198,9 +197,6 @@ class Scores:
     notes: Sequence[str] = ()
     result: Any = field(default=None, repr=False)
 
-    def __str__(self) -> str:
-        return self.to_markdown()
-
     def to_pandas(self) -> "pandas.DataFrame":
         """The main table as a data frame, see ``ScoreTable.to_pandas``."""
         return self.tables[0].to_pandas()
@@ -208,6 +204,8 @@ class Scores:
     def to_markdown(self) -> str:
         """Every table, one after another."""
         return "\n".join(table.to_markdown() for table in self.tables)
+
+    __str__ = to_markdown
 
     def to_latex(self) -> str:
         """Every table environment, one after another."""
