@@ -358,5 +358,5 @@ def passed(before: int, now: int, interval: int, *, ended: bool) -> bool:
 
 def kept(before: int, now: int, interval: int, *, ended: bool) -> bool:
     """As ``passed``, and at halves of the first interval, so that an early collapse leaves a good state."""
-    halves = takewhile(FIRST_KEPT_IMAGES.__le__, (interval // 2**half for half in count(1)))
+    halves = takewhile(lambda at: at >= FIRST_KEPT_IMAGES, (interval // 2**half for half in count(1)))
     return passed(before, now, interval, ended=ended) or any(before < early <= now for early in halves)

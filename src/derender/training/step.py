@@ -68,7 +68,11 @@ def training_step(
         ranks: those that share the batch; the mean of their terms is the batch's.
         chunks: number of chunks in which networks and renderer work, to save memory.
     """
-    count, encode = images.shape[0], lambda rows: model.encode(rows["images"])
+    count = images.shape[0]
+
+    def encode(rows: Columns) -> dict[str, Tensor]:
+        return model.encode(rows["images"])
+
     with precision():
         codes = in_chunks(encode, {"images": images}, chunks)
         shared = share_codes(codes, [f.name for f in model.factors if f.mirrored], own, ranks)
