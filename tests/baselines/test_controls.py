@@ -6,10 +6,10 @@ import torch
 from sklearn.decomposition import PCA
 
 from derender.baselines import controls
-from derender.baselines.model import optional
 from derender.data import ImageSet
 from derender.features import model_fingerprint
 from derender.model import Derenderer
+from derender.storage.places import optional
 
 
 def pictures(count: int = 30, size: int = 8, seed: int = 0) -> ImageSet:

@@ -1,26 +1,15 @@
 """DINOv2: the numbers that come back, and weights that are refused."""
 
 import json
-import os
 import pickle
 
 import pytest
 import torch
+from tests.trust.test_no_code import Bomb
 from torch.nn.functional import interpolate
 from transformers import Dinov2Config, Dinov2Model, ViTConfig, ViTModel
 
 from derender.baselines.dinov2 import IMAGENET_MEAN, IMAGENET_STD, Dinov2
-
-
-class Attack:
-    """What a hostile pickle asks for; tests/trust/test_no_code.py has one for every reader."""
-
-    def __init__(self, command):
-        self.command = command
-
-    def __reduce__(self):
-        return os.system, (self.command,)
-
 
 TINY = {"hidden_size": 8, "num_hidden_layers": 2, "num_attention_heads": 2}
 TINY |= {"image_size": 28, "patch_size": 14}
@@ -53,7 +42,7 @@ def test_other_weights_than_a_dinov2_in_one_safetensors_file_are_refused(dinov2,
     _, net = dinov2
     pickled, other, deeper, parts = (tmp_path / name for name in ("pickled", "other", "deeper", "parts"))
     net.config.save_pretrained(pickled)
-    (pickled / "pytorch_model.bin").write_bytes(pickle.dumps(Attack(f"touch {tmp_path / 'it-ran'}")))
+    (pickled / "pytorch_model.bin").write_bytes(pickle.dumps(Bomb(tmp_path / "it-ran")))
     ViTModel(ViTConfig(**TINY, intermediate_size=8)).save_pretrained(other)
     net.save_pretrained(deeper)
     Dinov2Config(**{**TINY, "num_hidden_layers": 3}).save_pretrained(deeper)

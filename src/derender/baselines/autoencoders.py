@@ -24,6 +24,7 @@ from derender.baselines import model as base
 from derender.networks.decoders import MapDecoder
 from derender.networks.encoders import Encoder, NetworkSettings
 from derender.settings import Settings
+from derender.storage.places import optional
 
 Grid = Float[Tensor, "n d gh gw"]
 """One vector for each of the places of a grid."""
@@ -188,7 +189,7 @@ class Vqvae(base.LoopModel):
             *(Residual(width, normalised=True), nn.BatchNorm2d(width)),
             *(Residual(width, normalised=True), nn.BatchNorm2d(width)),
         )
-        self.codebook = base.optional("vector_quantize_pytorch", "the baseline vqvae").VectorQuantize(
+        self.codebook = optional("vector_quantize_pytorch", "the baseline vqvae").VectorQuantize(
             dim=width, codebook_size=settings.codes, accept_image_fmap=True, learnable_codebook=True,
             ema_update=False, rotation_trick=False, kmeans_init=True, commitment_weight=0.0,
             threshold_ema_dead_code=settings.dead_below,

@@ -16,11 +16,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
-from derender.baselines.model import optional
 from derender.data import ImageSet
 from derender.features import FeatureTable, Progress, embed_image_set, table_labels
 from derender.inputs import as_images, part_of
 from derender.model import load
+from derender.storage.places import optional
 
 ORIENTATIONS, BLOCK_CELLS, CELL_PX = 9, 2, 8
 BLUR_PX = 0.75

@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from derender.baselines import model as base
+from derender.storage.bounded import first_line
+from derender.storage.places import optional
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -66,7 +68,7 @@ class Dinov2(base.BaselineModel):
                 f"{source} has no {base.WEIGHTS_FILE}: give a folder with config.json and the weights in "
                 "that one file. Weights in parts, and pickles, which can run code, are not opened"
             )
-        library = base.optional("transformers", "the baseline dinov2")
+        library = optional("transformers", "the baseline dinov2")
         try:
             tree, _ = library.PretrainedConfig.get_config_dict(source, local_files_only=True)
             if tree.get("model_type") != "dinov2":
@@ -75,14 +77,10 @@ class Dinov2(base.BaselineModel):
                 source, local_files_only=True, use_safetensors=True, output_loading_info=True
             )
         except OSError as error:
-            if folder.is_dir():
-                raise ValueError(
-                    f"{source} holds no config.json and {base.WEIGHTS_FILE} that can be read "
-                    f"({str(error).splitlines()[0]})"
-                ) from error
             raise ValueError(
-                f"the weights {source} are not in the Hugging Face cache and nothing is downloaded here: run "
-                f"'hf download {source}' once where there is a network, or name their folder"
+                f"the weights {source} are not in the Hugging Face cache or cannot be read, and nothing is "
+                f"downloaded here ({first_line(error)}): run 'hf download {source}' once where there is a "
+                "network, or name their folder"
             ) from error
         if missing := sorted(info["missing_keys"]):
             raise ValueError(f"{source} is of another architecture: it has no {missing[0]!r}")

@@ -5,7 +5,6 @@ run code; pickles are never opened. Checkpoints, exact resume, early stop and re
 model (training/loop.py).
 """
 
-import importlib
 import json
 import time
 from abc import ABC, abstractmethod
@@ -13,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, ClassVar
 
 import torch
@@ -41,17 +39,6 @@ Images = Float[Tensor, "n 3 h w"]
 Features = dict[str, Float[Tensor, "n _"]]
 SheetOf = Callable[[Callable[[Any, Tensor], dict[str, Tensor]]], Any]
 """Makes the loop's drawing function from one that gives images by column."""
-
-
-def optional(package: str, needed_for: str, extra: str = "baselines") -> ModuleType:
-    """A package that only a few calls need; ValueError with the extra to install where it is missing."""
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise ValueError(
-            f"{needed_for} needs the package {package.split('.')[0]}, which is not here ({error}): "
-            f"pip install 'derender[{extra}]'"
-        ) from error
 
 
 class BaselineSettings(Settings):

@@ -15,11 +15,12 @@ from pydantic import Field, field_validator
 from torch import Generator, Tensor
 from torch.nn.functional import cross_entropy
 
-from derender.baselines.model import BaselineModel, BaselineSettings, Features, Images, ShortRun, optional
+from derender.baselines.model import BaselineModel, BaselineSettings, Features, Images, ShortRun
 from derender.baselines.simclr import AugmentSettings, augment
 from derender.data import ImageSet, as_float, split_indices
 from derender.features import map_batches, missing
 from derender.settings import Settings
+from derender.storage.places import optional
 from derender.training.task import TrainResult
 
 MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)

@@ -45,6 +45,7 @@ from derender.features.parquet import factor_column, factor_values
 from derender.features.table import FeatureTable, check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured, write_whole
 from derender.storage.bounded import parse_json, read_json
+from derender.storage.places import optional
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]
 """Opens the stream anew, in whatever process."""
@@ -142,13 +143,8 @@ def ray_blocks(
     Raises:
         ValueError: Ray is not installed.
     """
-    try:
-        import ray  # pyright: ignore[reportMissingImports]
-        import ray.data  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ValueError(
-            "engine 'ray' needs Ray: pip install 'derender[ray]', or use engine 'local'"
-        ) from error
+    ray = optional("ray", "engine 'ray'", "ray")
+    optional("ray.data", "engine 'ray'", "ray")
     left = None if stream.limit is None else max(0, stream.limit - start)
     end = start + sum(1 for _ in islice(stream.samples(start), left))
     starts = [{"start": first} for first in range(start, end, batch_size)]

@@ -28,11 +28,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from derender.baselines.controls import untrained_twin
-from derender.baselines.model import optional
 from derender.evaluation.pixels import masked_ssim
 from derender.interpretation.probe import Probe
 from derender.networks.encoders import activations
-from derender.storage.places import require_known
+from derender.storage.places import optional, require_known
 
 OUTPUTS = ("logit", "probability")
 STEPS = {"logit": 2, "probability": 32}  # a logit is linear in the features: any number is exact

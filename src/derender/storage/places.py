@@ -3,6 +3,7 @@
 A model is looked for in a folder, among the bundled models, then on the Hugging Face Hub.
 """
 
+import importlib
 import json
 import re
 from collections.abc import Iterable, Sequence
@@ -25,6 +26,17 @@ SUFFIXES = (
     *(".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".heic", ".heif"),
 )
 """File names that end in one of these are taken for images."""
+
+
+def optional(package: str, needed_for: str, extra: str = "baselines") -> Any:
+    """A package that only a few calls need; ValueError with the extra to install where it is missing."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ValueError(
+            f"{needed_for} needs the package {package.split('.')[0]}, which is not here ({error}): "
+            f"pip install 'derender[{extra}]'"
+        ) from error
 
 
 def bundled_models() -> tuple[str, ...]:
