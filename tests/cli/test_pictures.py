@@ -61,6 +61,14 @@ def test_relight_sweeps_and_says_which_light(tiny, photos, tmp_path, numbers):
     assert told["sheets"] == [str(out / "sheet.png")]
 
 
+def test_photographs_are_decomposed_by_faces_64_unless_a_model_is_named(photos, tmp_path):
+    for name, words in (("default", ()), ("named", ("-m", "faces-64"))):
+        assert run("decompose", photos / "0.png", "-o", tmp_path / name, *words) == 0
+    with np.load(tmp_path / "default/0/scene.npz") as one, np.load(tmp_path / "named/0/scene.npz") as other:
+        assert one["depth"].shape[-1] == 64
+        np.testing.assert_array_equal(one["depth"], other["depth"])
+
+
 def test_relight_ends_in_the_light_of_another(tiny, photos, tmp_path):
     out = tmp_path / "out"
     words = ["--like", photos / "2.png", "--stills", 2, "--film", "none", "--size", 32]
