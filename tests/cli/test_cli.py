@@ -70,13 +70,16 @@ def test_bad_arguments_are_refused_before_anything_heavy_is_imported(arguments, 
     assert (code, found) == (2, "") and reason in printed
 
 
-def test_one_image_is_decomposed_without_slow_packages(tmp_path):
+SLOW = ("numba", "matplotlib", "sklearn", "scipy", "pyarrow", "torch._dynamo", "tensorboard")
+
+
+@pytest.mark.parametrize(
+    ("command", "slow"), [("decompose", SLOW), ("relight", ("sklearn", "torch._dynamo", "tensorboard"))]
+)
+def test_one_image_is_opened_without_slow_packages(command, slow, tmp_path):
     file = tmp_path / "a.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(file)
-    slow = ("numba", "matplotlib", "sklearn", "scipy", "pyarrow", "torch._dynamo", "tensorboard")
-    code, printed, found = imported_by(
-        "decompose", file, "-m", "faces-64", "-o", tmp_path / "out", among=slow
-    )
+    code, printed, found = imported_by(command, file, "-o", tmp_path / "out", among=slow)
     assert (code, found) == (0, ""), printed
 
 

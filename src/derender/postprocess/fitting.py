@@ -127,7 +127,7 @@ class Fitting(nn.Module):
         table = [_COORDINATES] * sum(sizes[:2]) + [_FURTHER] * sum(sizes[2:-2]) + _LIGHT + _CAMERA
         rates, low, high = images.new_tensor(table).T.contiguous()
         moved = (torch.cat(start, dim=1) / rates).requires_grad_()  # Adam steps as far for any unit
-        optimiser = torch.optim.Adam([moved], lr=1.0, betas=(0.9, 0.95), fused=True)
+        mean, square = torch.zeros_like(moved), torch.zeros_like(moved)
 
         def rendered() -> tuple[Scene, Tensor, list[Tensor]]:
             """The present scenes, the error of each, and their coordinates."""
@@ -145,14 +145,17 @@ class Fitting(nn.Module):
 
         before = torch.empty(0)
         for step in range(steps):
-            optimiser.param_groups[0]["lr"] = _LATE_RATE if step >= _LATE * steps else 1.0
+            rate, count = _LATE_RATE if step >= _LATE * steps else 1.0, moved.new_tensor(step + 1.0)
             _, error, found = rendered()
             before = error.detach() if step == 0 else before
             usual = torch.stack([value.square().mean(dim=1) for value in found]).sum(dim=0)
-            optimiser.zero_grad(set_to_none=True)
-            (error / _NOISE + self.settings.prior * usual).sum().backward()
-            optimiser.step()
+            loss = (error / _NOISE + self.settings.prior * usual).sum()
+            (gradient,) = torch.autograd.grad(loss, moved)
             with torch.no_grad():
+                torch.ops.aten._fused_adam_(  # torch.optim first imports the compiler, for a second
+                    [moved], [gradient], [mean], [square], [], [count], lr=rate, beta1=0.9, beta2=0.95,
+                    eps=1e-8, weight_decay=0.0, amsgrad=False, maximize=False,
+                )  # fmt: skip
                 moved.clamp_(low / rates, high / rates)
         with torch.no_grad():
             fitted, after, found = rendered()

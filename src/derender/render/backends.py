@@ -97,14 +97,17 @@ def operators(
         def made(
             suffix: str, tensors: Sequence[str], results: int, function: Operation, room: Operation
         ) -> Any:
-            given = ", ".join(f"Tensor {one}" for one in tensors)
-            several = "Tensor" if results == 1 else f"({', '.join(['Tensor'] * results)})"
-            operator = torch.library.custom_op(
-                f"derender::{name}_{backend}{suffix}", function, mutates_args=(), device_types=devices,
-                schema=f"({given}, float focal_px) -> {several}",
-            )  # fmt: skip
-            operator.register_fake(lambda *values: _one_or_all(room(*values[:-1])))
-            return operator
+            several = ", ".join(["Tensor"] * results)
+            whole = f"derender::{name}_{backend}{suffix}"
+            schema = f"({', '.join(f'Tensor {one}' for one in tensors)}, float focal_px) -> "
+            torch.library.define(
+                whole,
+                schema + (several if results == 1 else f"({several})"),
+                tags=torch.Tag.pt2_compliant_tag,
+            )
+            torch.library.impl(whole, devices)(function)
+            torch.library.register_fake(whole, lambda *values: _one_or_all(room(*values[:-1])))
+            return getattr(torch.ops.derender, f"{name}_{backend}{suffix}").default
 
         def keep(ctx: Any, inputs: tuple, output: Any) -> None:
             *values, ctx.focal_px = inputs
@@ -117,7 +120,7 @@ def operators(
 
         operator = made("", inputs, len(outputs), run, room)
         derivative = made("_backward", [*grads, *inputs, *kept], len(inputs), run_backward, gradients)
-        operator.register_autograd(differentiate, setup_context=keep)
+        torch.library.register_autograd(operator, differentiate, setup_context=keep)
         return operator
 
     return {
