@@ -241,7 +241,7 @@ def test_a_full_disk_is_one_line(trained, faces, tmp_path, monkeypatch, refused)
     def full(*_, **__):
         raise OSError(28, "No space left on device", "f.parquet")
 
-    monkeypatch.setattr("derender.features.embedding.write_columns", full)
+    monkeypatch.setattr("derender.features.embedding.write_tables", full)
     line = refused("embed", "-m", trained, "-d", faces, "--out", tmp_path / "f.parquet")
     assert line == "derender: f.parquet: no space left on device; free some space and run the command again"
 

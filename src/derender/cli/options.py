@@ -8,7 +8,7 @@ command that reads images is one field here, used in one method here.
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -30,7 +30,6 @@ from derender.storage.places import (
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
-    from derender.photo.video import Edit as VideoEdit
     from derender.report.editing import Edited
     from derender.report.opening import ImageOpener, OpenedImage
 
@@ -230,30 +229,23 @@ class ImageFiles:
         list[Path], typer.Argument(help="Image files, videos, or folders of them.", metavar="IMAGE...")
     ]
     out: OutFolder
-    resume: Annotated[bool, typer.Option("--resume", help="Leave out images that are done.")] = False
+    resume: bool = option(False, "Leave out images that are done.", "--resume")
 
     def __post_init__(self) -> None:
         require_image(self.images)
 
     def edit(
-        self,
-        opener: "ImageOpener",
-        edit: "Callable[[OpenedImage], Edited]",
-        output: Output,
-        *,
-        sheet: bool | None = None,
-        beside: "Sequence[OpenedImage]" = (),
-        video: "VideoEdit | None" = None,
+        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: Output, **how: Any
     ) -> None:
-        """Edit and write every image and report it; exit code 2 where one that was named cannot be read."""
+        """Edit, write and report every image; exit code 2 where one that was named cannot be read.
+
+        ``how`` are further keywords of ``write_images``.
+        """
         from derender.report.editing import write_images
 
+        how |= {"force": output.force, "resume": self.resume}
         with progress_bar("drawing", "images") as report:
-            written = write_images(
-                opener, self.images, self.out, edit,
-                force=output.force, resume=self.resume, sheet=sheet, beside=beside, video=video,
-                progress=report,
-            )  # fmt: skip
+            written = write_images(opener, self.images, self.out, edit, **how, progress=report)
         for note in written.notes():
             notice(note)
         count = len(written.images)
