@@ -14,6 +14,7 @@ and drawn anew; what they cannot explain stays.
 """
 
 from math import atan, degrees, radians, tan
+from typing import Any
 
 import cv2
 import numpy as np
@@ -178,26 +179,32 @@ class PhotoDetail:
         shift, ratio, drawn, trust, seen, veil, new = shown
         drawn = drawn.clamp(DARKEST, 1)
         image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
-        if bool((seen < 0.999).any()):
-            shift, ratio, weight, veil = self._all_enlarged(
-                mirror_shift, mirror_ratio, mirror_seen, mirror_veil
-            )
-            other = self._detailed(shift, ratio, drawn, trust, veil, new)
-            image = image + weight * other + (1 - seen - weight) * _veiled(drawn, new)
+        if bool((unseen := (seen < 0.999).any(dim=0)[0]).any()):
+            part = (..., *(slice(int(at.min()), int(at.max()) + 1) for at in unseen.nonzero().T))
+            mirrored = self._all_enlarged(mirror_shift, mirror_ratio, mirror_seen, mirror_veil)
+            shift, ratio, weight, veil = (field[part] for field in mirrored)
+            drawn, trust, seen, new = (field[part] for field in (drawn, trust, seen, new))
+            other = self._detailed(shift, ratio, drawn, trust, veil, new, part)
+            image[part] += weight * other + (1 - seen - weight) * _veiled(drawn, new)
         return image.clamp(0, 1)
 
-    def _detailed(self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, *veils: Tensor) -> Tensor:
-        """The photograph looked up at shifted places, its shading changed, and its veil to the second."""
-        veil, new = veils
+    def _detailed(
+        self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, veil: Tensor, new: Tensor,
+        part: tuple[Any, ...] = (...,),
+    ) -> Tensor:  # fmt: skip
+        """The photograph looked up at shifted places, its shading changed, and its veil to the new one."""
         unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
-        places = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift)
-        places = places + unit * shift.permute(0, 2, 3, 1)
+        own = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift).permute(0, 3, 1, 2)
+        places = (own[part] + unit * shift).permute(0, 2, 3, 1)
         photo = self.photo.expand(len(shift), -1, -1, -1)
         found = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
-        clear = _cleared(found, veil)
-        kept = clear.clamp(0, 1) if veil.shape[1] else clear
+        kept, beyond = found, 0.0
+        if veil.shape[1]:
+            clear = _cleared(found, veil)
+            kept = clear.clamp(0, 1)
+            beyond = _veiled(clear, veil) - _veiled(kept, veil)
         surface = torch.lerp(drawn.log(), (kept * ratio).clamp(DARKEST, 1).log(), trust).exp()
-        return _veiled(surface, new) + _veiled(clear, veil) - _veiled(kept, veil)
+        return _veiled(surface, new) + beyond
 
     def _all_enlarged(self, *fields: Tensor) -> tuple[Tensor, ...]:
         return self._enlarged(torch.cat(fields, dim=1)).split([field.shape[1] for field in fields], dim=1)
@@ -309,7 +316,8 @@ def _blurred(maps: Tensor, reach: float) -> Tensor:
     reach = max(1, round(reach / 4))
     small = interpolate(maps, scale_factor=0.25, mode="area")
     for _ in range(3):
-        small = avg_pool2d(pad(small, (reach,) * 4, mode="replicate"), 2 * reach + 1, stride=1)
+        small = avg_pool2d(pad(small, (reach,) * 4, mode="replicate"), (2 * reach + 1, 1), stride=1)
+        small = avg_pool2d(small, (1, 2 * reach + 1), stride=1)
     return interpolate(small, maps.shape[-2:], mode="bilinear")
 
 
