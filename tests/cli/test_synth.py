@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.cli.conftest import run
+from tests.data.synthetic.test_morphable import dome, saved
 
 from derender.data import synthetic
 
@@ -35,14 +36,8 @@ def test_single_settings_identities_and_expressions(folder):
 
 
 def test_a_model_of_ones_own(folder):
-    y, x = np.mgrid[1.0:-1.0:9j, -1.0:1.0:9j]
-    corner = np.arange(81).reshape(9, 9)
-    upper = np.stack([corner[:-1, :-1], corner[1:, :-1], corner[:-1, 1:]], -1).reshape(-1, 3)
-    lower = np.stack([corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]], -1).reshape(-1, 3)
-    mean = np.stack([x, y, -(x**2) - y**2], -1).reshape(-1, 3)
-    components = mean[None] * [0.1, 0.0, 0.0]
-    triangles = np.concatenate([upper, lower])
-    np.savez(folder / "my.npz", mean=mean, triangles=triangles, components=components, std=[1.0])
+    mean, _ = dome()
+    saved(folder / "my.npz", components=mean[None] * [0.1, 0.0, 0.0], std=np.ones(1))
     rows = made(folder, "mine", "--count", "8", "--model", str(folder / "my.npz"))
     assert len(rows) == 8 and "hair" not in rows[0]
     with (folder / "mine" / "identities.csv").open() as file:
