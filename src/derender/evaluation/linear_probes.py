@@ -252,10 +252,15 @@ def logistic_weights(
     (rows, mean, back), labels = rotated(features), np.asarray(targets, np.float64)
     fold = np.random.default_rng(seed).permutation(len(rows)) % folds
     learned, single, losses = fold[:, None] != np.arange(folds), rows.astype(np.float32), []
+    truth = np.maximum(labels, 0)[:, None]
     for c in penalties:
         weights = solve_logistic(single, labels, learned, c, kind, tolerance=1e-3)
         logits = np.tensordot(single, weights[:-1], axes=1) + weights[-1]  # (n, folds, A)
-        losses.append(np.where(learned[:, :, None], 0.0, _losses(logits, labels, kind)).sum(axis=(0, 1)))
+        if kind == "classes":
+            loss = -(log_softmax(logits, axis=2) * truth).sum(axis=2, keepdims=True)
+        else:
+            loss = np.where(labels[:, None] >= 0, np.logaddexp(0, logits) - truth * logits, 0.0)
+        losses.append(np.where(learned[:, :, None], 0.0, loss).sum(axis=(0, 1)))
     chosen = np.asarray(penalties)[np.argmin(losses, axis=0)]
     whole = np.ones((len(rows), 1), bool)
     found = {c: solve_logistic(rows, labels, whole, c, kind)[:, 0] for c in set(chosen.tolist())}
@@ -299,11 +304,3 @@ def solve_logistic(
             if (size <= tolerance * start).all():
                 break
     return weights
-
-
-def _losses(logits: np.ndarray, targets: np.ndarray, kind: str) -> np.ndarray:
-    """Negative log-likelihood of each row: (N, P, A), or (N, P, 1) for classes; 0 where unknown."""
-    truth = targets[:, None]
-    if kind == "classes":
-        return -(log_softmax(logits, axis=2) * np.maximum(truth, 0)).sum(axis=2, keepdims=True)
-    return np.where(truth >= 0, np.logaddexp(0, logits) - truth * logits, 0.0)
