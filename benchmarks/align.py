@@ -151,8 +151,8 @@ def crops(faces: Faces, count: int) -> Iterator[Case]:
 def of_package(pixels: np.ndarray) -> list[Eyes]:
     """MTCNN once, at the photograph's own size."""
     return [
-        np.array([found["keypoints"][name] for name in ("left_eye", "right_eye")], float)
-        for found in detector().detect_faces(pixels)
+        np.array([result["keypoints"][name] for name in ("left_eye", "right_eye")], float)
+        for result in detector().detect_faces(pixels)
     ]
 
 
@@ -168,7 +168,7 @@ def lbp() -> Detector:
 
     cascade = Cascade(data.lbp_frontal_face_cascade_filename())
 
-    def found(pixels: np.ndarray) -> list[Eyes]:
+    def result(pixels: np.ndarray) -> list[Eyes]:
         largest = min(pixels.shape[:2])
         boxes = cascade.detect_multi_scale(
             img=pixels, scale_factor=1.2, step_ratio=1, min_size=(24, 24), max_size=(largest, largest)
@@ -176,7 +176,7 @@ def lbp() -> Detector:
         offsets = np.array([[0.32, 0.40], [0.68, 0.40]])
         return [np.array([b["c"], b["r"]]) + offsets * b["width"] for b in boxes]
 
-    return found
+    return result
 
 
 def scored(cases: Iterator[Case], detectors: dict[str, Detector]) -> dict[str, dict]:
@@ -188,10 +188,10 @@ def scored(cases: Iterator[Case], detectors: dict[str, Detector]) -> dict[str, d
         sides += case.sides
         for name, detect in detectors.items():
             begin, row = time.perf_counter(), sums[name]
-            found = detect(case.pixels)
+            results = detect(case.pixels)
             row["seconds"] += time.perf_counter() - begin
-            row["found"] += len(found)
-            left = list(found)
+            row["found"] += len(results)
+            left = list(results)
             for truth, exact in zip(case.eyes, case.exact, strict=True):
                 apart = np.hypot(*(truth[1] - truth[0]))
                 away = [np.hypot(*(eyes.mean(axis=0) - truth.mean(axis=0))) for eyes in left]
@@ -237,8 +237,8 @@ def framings(faces: Faces, count: int, seed: int) -> dict[str, dict[str, float]]
             cuts = [found_frame(one, model, frame)[0].cut(one, model.image_size) for one in pixels]
         except ValueError:
             return None
-        found = model.embed(torch.from_numpy(np.stack(cuts)).float() / 255)
-        both = [found[name].detach().flatten(1).numpy() for name in ("geometry", "albedo")]
+        results = model.embed(torch.from_numpy(np.stack(cuts)).float() / 255)
+        both = [results[name].detach().flatten(1).numpy() for name in ("geometry", "albedo")]
         return (
             np.concatenate([one / np.linalg.norm(one, axis=1, keepdims=True) for one in both], axis=1)
             / 2**0.5
@@ -252,12 +252,12 @@ def framings(faces: Faces, count: int, seed: int) -> dict[str, dict[str, float]]
                 tile, eyes = faces.draw(int(number))
                 scene = background(rng, 640, 480)
                 views = nine(scene, tile) if kind == "nine framings" else three(scene, tile, eyes)
-                found = features(views, frame)
-                if found is None:
+                results = features(views, frame)
+                if results is None:
                     missed += 1
                     continue
-                alike = (found @ found.T)[np.triu_indices(len(found), 1)]
-                lowest.append(alike.min()), mean.append(alike.mean()), first.append(found[0])
+                alike = (results @ results.T)[np.triu_indices(len(results), 1)]
+                lowest.append(alike.min()), mean.append(alike.mean()), first.append(results[0])
             others = np.array(first) @ np.array(first).T
             result[f"{kind}, --frame {frame}"] = {
                 "pictures": len(first),

@@ -54,10 +54,10 @@ def forty_attributes(features: np.ndarray, trees: int) -> dict[str, float | int]
     def each_of_ours() -> list[float]:
         return [cluster_scores(one, cut(ward_tree(features), 2)).accuracy for one in labels[:trees]]
 
-    ours, found = seconds(once)
+    ours, result = seconds(once)
     obvious, expected = seconds(each)
     obvious_ours, same = seconds(each_of_ours)
-    assert np.allclose(found[:trees], expected) and np.allclose(found[:trees], same), "different clusters"
+    assert np.allclose(result[:trees], expected) and np.allclose(result[:trees], same), "different clusters"
     scale = ATTRIBUTES / trees
     return {
         "one_tree_s": ours,

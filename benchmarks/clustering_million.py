@@ -80,13 +80,13 @@ def how_far(rows: int) -> dict[str, Any]:
     began = time.perf_counter()
     tree = ward_tree(features)
     result["exact_ward_s"], began = time.perf_counter() - began, time.perf_counter()
-    found = ward_in_cells(features, leaves, cell)
+    results = ward_in_cells(features, leaves, cell)
     result["ward_in_cells_s"] = time.perf_counter() - began
     few_leaves = ward_in_cells(features, leaves, neighbours.CELL_ROWS)
     half = ward_tree(features[:, ::2])
     for count in (one for one in COUNTS if one <= leaves):
         exact = cut(tree, count)
-        result[f"ward_ari_{count}"] = adjusted_rand_score(cut(n_clusters=count, **found), exact)
+        result[f"ward_ari_{count}"] = adjusted_rand_score(cut(n_clusters=count, **results), exact)
         result[f"ward_ari_{count}_cells_of_2000"] = adjusted_rand_score(
             cut(n_clusters=count, **few_leaves), exact
         )

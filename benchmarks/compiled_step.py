@@ -72,10 +72,10 @@ def measure(name: str, size: int, batch: int, precision: str, rounds: int) -> di
     images = torch.rand(batch, 3, size, size, generator=torch.Generator().manual_seed(0))
     ours, eager = step_of(name, size, precision, training_step)
     other, compiled = step_of(name, size, precision, torch.compile(training_step))
-    found: list[float] = []
-    warming = with_children(lambda: found.append(compiled(images, False)))
+    result: list[float] = []
+    warming = with_children(lambda: result.append(compiled(images, False)))
     loss = eager(images, False)
-    apart = abs(found[0] / loss - 1)
+    apart = abs(result[0] / loss - 1)
     mine, others = (torch.cat([p.grad.flatten() for p in m.parameters()]) for m in (ours, other))
     gradient = ((mine - others).norm() / mine.norm()).item()
     most = TOLERANCES[precision]

@@ -31,13 +31,13 @@ def in_turns(work: Callable[[], Any], rounds: int) -> tuple[dict[str, Any], list
     results: list[Any] = []
     for number in range(rounds + 1):
         results = []
-        for most, found in seconds.items():
+        for most, result in seconds.items():
             with patch.object(embedding, "MOST", most):
                 began = time.process_time()
                 results.append(work())
                 if number or not rounds:
-                    found.append(time.process_time() - began)
-    before, now = (statistics.median(found) for found in seconds.values())
+                    result.append(time.process_time() - began)
+    before, now = (statistics.median(result) for result in seconds.values())
     return {"portions_of_4_s": before, "now_s": now, "ratio": before / now, "rounds": rounds}, results
 
 

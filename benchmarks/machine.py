@@ -17,9 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
     """The options that every benchmark has."""
-    found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
-    return found
+    result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    result.add_argument("--json", type=Path, help="also write the numbers, machine and versions here")
+    return result
 
 
 def publish(result: dict[str, Any], file: Path | None) -> None:

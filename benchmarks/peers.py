@@ -72,12 +72,12 @@ class Embree:
             scene = self.scene()
             self.mesh(scene, np.ascontiguousarray(points[self.corners], np.float32))
             triangle.append(scene.run(np.zeros_like(self.rays), self.rays))
-        found = torch.from_numpy(np.stack(triangle)).long().view(-1, self.size, self.size)
-        uv, depth = intersect(vertices, found, self.focal)
+        result = torch.from_numpy(np.stack(triangle)).long().view(-1, self.size, self.size)
+        uv, depth = intersect(vertices, result, self.focal)
         gradient = None
         if cotangents is not None:
             (gradient,) = torch.autograd.grad((uv, depth), vertices, cotangents)
-        return uv.detach(), depth.detach(), found >= 0, gradient
+        return uv.detach(), depth.detach(), result >= 0, gradient
 
 
 class Warp:
@@ -133,9 +133,9 @@ class Mitsuba:
 
     def __init__(self, maps: int, size: int, focal: float):
         if "DRJIT_LIBLLVM_PATH" not in os.environ:
-            found = sorted(Path("/usr/lib").rglob("libLLVM-*.so*"))
-            if found:
-                os.environ["DRJIT_LIBLLVM_PATH"] = str(found[-1])
+            results = sorted(Path("/usr/lib").rglob("libLLVM-*.so*"))
+            if results:
+                os.environ["DRJIT_LIBLLVM_PATH"] = str(results[-1])
         self.dr, self.mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")
         self.mi.set_variant("llvm_ad_rgb")
         self.size = size

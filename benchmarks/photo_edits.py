@@ -52,14 +52,14 @@ class Case:
 
 def scores(case: Case, methods: Mapping[str, Callable[[Case], Tensor]]) -> dict[str, tuple[float, float]]:
     """PSNR and SSIM of each method."""
-    found = {}
+    results = {}
     for name, method in methods.items():
         drawn = method(case).clamp(0, 1)
         error = (drawn - case.truth)[:, case.place].square().mean().clamp(min=1e-10)
         grey = [image.mean(dim=0).numpy() for image in (drawn, case.truth)]
         similar = structural_similarity(*grey, data_range=1.0, full=True)[1]
-        found[name] = (float(-10 * error.log10()), float(similar[case.place.numpy()].mean()))
-    return found
+        results[name] = (float(-10 * error.log10()), float(similar[case.place.numpy()].mean()))
+    return results
 
 
 def edits(model: derender.Derenderer) -> dict[str, Callable[[Case], Tensor]]:
@@ -97,14 +97,14 @@ def yale(
     """Mean scores by method and by the angle between light and view."""
     source, lights = open_source(path), {}
     for file in source.files:
-        if found := re.search(r"(yaleB\d+)_P00A([+-]\d+)E([+-]\d+)", file):
-            lights[found[1], int(found[2]), int(found[3])] = file
+        if result := re.search(r"(yaleB\d+)_P00A([+-]\d+)E([+-]\d+)", file):
+            lights[result[1], int(result[2]), int(result[3])] = file
     people = sorted({person for person, *_ in lights})
     people = people[: len(people) // 2] if half == "first" else people[len(people) // 2 :]
     sums: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     photos = {key: square(source.read(file)) for key, file in lights.items() if key[0] in people}
-    found = scenes_of(model, list(photos.values()), steps)
-    scenes = {key: found[row] for row, key in enumerate(photos)}
+    result = scenes_of(model, list(photos.values()), steps)
+    scenes = {key: result[row] for row, key in enumerate(photos)}
     for number, person in enumerate(people):
         own, other = (person, 0, 0), people[(number + 1) % len(people)]
         seen = model.render(at_size(scenes[own], SIZE["yale"])).mask[0] > 0.5
@@ -140,8 +140,8 @@ def heads(
         lit = light.model_copy(update={"yaw_deg": (yaw_light, yaw_light)})
         seen = view.model_copy(update={"yaw_deg": (yaw_view, yaw_view)})
         settings = FaceSettings(light=lit, view=seen, pictures_per_identity=1)
-        found = faces.generate(count, SIZE["heads"], seed, settings)
-        return torch.from_numpy(found.images).float() / 255, torch.from_numpy(found.mask > 0)
+        result = faces.generate(count, SIZE["heads"], seed, settings)
+        return torch.from_numpy(result.images).float() / 255, torch.from_numpy(result.mask > 0)
 
     photos, masks = made()
     scenes = scenes_of(model, photos, steps)

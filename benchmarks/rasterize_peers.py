@@ -43,9 +43,9 @@ def held_against(peer: Peer, expected: Peer, vertices: Tensor) -> dict[str, Any]
     draw = torch.Generator().manual_seed(1)
     cotangents = torch.randn(uv.shape, generator=draw), torch.randn(depth.shape, generator=draw)
     cotangents = cotangents[0] * both[..., None], cotangents[1] * both
-    wanted, found = (one.run(vertices, cotangents)[3] for one in (expected, peer))
-    assert wanted is not None and found is not None
-    apart = float((found - wanted).norm() / wanted.norm())
+    wanted, result = (one.run(vertices, cotangents)[3] for one in (expected, peer))
+    assert wanted is not None and result is not None
+    apart = float((result - wanted).norm() / wanted.norm())
     share = float(alike.float().mean())
     return {
         "pixels_alike": share,
@@ -85,16 +85,16 @@ def milliseconds(peers: dict[str, Peer], vertices: Tensor, rounds: int) -> dict[
 
 def installed() -> tuple[dict[str, str], list[str]]:
     """Versions of the peers that are here, and names of those that are not."""
-    found, missing = {}, []
+    result, missing = {}, []
     for name, (module, _) in PEERS.items():
         if importlib.util.find_spec(module) is None:
             missing.append(name)
             continue
         try:
-            found[name] = version(DISTRIBUTIONS[module])
+            result[name] = version(DISTRIBUTIONS[module])
         except PackageNotFoundError:
-            found[name] = "unknown version"
-    return found, missing
+            result[name] = "unknown version"
+    return result, missing
 
 
 def one_size(size: int, maps: int, rounds: int, versions: dict[str, str]) -> dict[str, Any]:

@@ -74,11 +74,11 @@ def most_memory_mb() -> float:
 def start(source: Path) -> dict[str, Any]:
     """Seconds until a folder or zip is known, and what is known of it."""
     began, cpu = time.perf_counter(), time.process_time()
-    with list_images(source) as found:
+    with list_images(source) as result:
         listed = time.perf_counter() - began
-        mark = found.identity()
+        mark = result.identity()
     return {
-        "files": len(found.table.files), "mark": mark, "listed_s": listed,
+        "files": len(result.table.files), "mark": mark, "listed_s": listed,
         "known_s": time.perf_counter() - began, "cpu_s": time.process_time() - cpu,
         "memory_mb": most_memory_mb(),
     }  # fmt: skip

@@ -17,16 +17,16 @@ Reader = Callable[[dict[str, Any]], Iterator[tuple[str, str]]]
 
 def by_row(what: str, result: str) -> Reader:
     """A reader of files that hold one figure a row."""
-    return lambda found: ((what.format(**row), result.format(**row)) for row in found["rows"])
+    return lambda results: ((what.format(**row), result.format(**row)) for row in results["rows"])
 
 
-def training_step(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["rows"][1:]:
+def training_step(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in result["rows"][1:]:
         yield f"training step, {row['name']} / literal", f"{row['ratio']:.2f}x"
 
 
-def rasterize_peers(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["rows"]:
+def rasterize_peers(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in result["rows"]:
         what = f"rasterise both ways, {row['maps']} maps of {row['size']}x{row['size']}"
         ours = row["milliseconds"]["derender, Numba"]["both ways"]
         for name, check in row["checks"].items():
@@ -35,53 +35,53 @@ def rasterize_peers(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
                 yield f"{what}, {name}{note} / ours", f"{row['milliseconds'][name]['both ways'] / ours:.1f}x"
 
 
-def embedding(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for way, ratio in found["against_training"].items():
+def embedding(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for way, ratio in result["against_training"].items():
         if way != "training step":
-            yield f"{way} / training step, preset paper ({found['clock']} clock)", f"{ratio:.1f}x"
+            yield f"{way} / training step, preset paper ({result['clock']} clock)", f"{ratio:.1f}x"
 
 
-def reading(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for kind, row in found["starts"].items():
+def reading(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for kind, row in result["starts"].items():
         later = min(one["known_s"] for one in row["later"])
         what = f"{kind} of {row['files']:,} known, first start and later"
         yield what, f"{row['first']['known_s']:.1f} s, {later:.1f} s"
 
 
-def clustering(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    forty = found["forty_attributes"]
+def clustering(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    forty = result["forty_attributes"]
     yield (
-        f"forty attributes from one tree of {found['rows']:,} rows / a tree for each",
+        f"forty attributes from one tree of {result['rows']:,} rows / a tree for each",
         f"{forty['ratio']:.0f}x",
     )
     yield "the same / SciPy's tree for each", f"{forty['ratio_to_scipy']:.0f}x"
-    for name, taken in found["one_tree_cpu_s"].items():
+    for name, taken in result["one_tree_cpu_s"].items():
         if name != "ours" and not isinstance(taken, str):
-            ratio = taken / found["one_tree_cpu_s"]["ours"]
-            yield f"one tree of {found['rows']:,} rows, CPU seconds, {name} / ours", f"{ratio:.2f}x"
+            ratio = taken / result["one_tree_cpu_s"]["ours"]
+            yield f"one tree of {result['rows']:,} rows, CPU seconds, {name} / ours", f"{ratio:.2f}x"
 
 
-def clustering_million(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["checked"]:
+def clustering_million(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in result["checked"]:
         indices = [row[name] for name in row if name.startswith("ward_ari_") and name[9:].isdigit()]
         yield (
             f"Ward by cells against exact, {row['rows']:,} rows, ARI",
             f"{min(indices):.2f}..{max(indices):.2f}",
         )
         yield f"nearest rows that cells find, {row['rows']:,} rows", f"{row['nearest_found']:.1%}"
-    for row in found["runs"]:
-        rows = found["table"]["rows"]
+    for row in result["runs"]:
+        rows = result["table"]["rows"]
         yield f"evaluate cluster, {rows:,} rows of 512, {row['method']}", f"{row['seconds']:.0f} s"
 
 
-def bench(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for row in found["rows"]:
+def bench(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for row in result["rows"]:
         yield f"derender bench: {row['what']}", f"{row['ratio']:.2f}x ({row['least']:.2f}..{row['most']:.2f})"
-    yield "derender bench: training waits for data", f"{found['waiting']['share']:.2%}"
+    yield "derender bench: training waits for data", f"{result['waiting']['share']:.2%}"
 
 
-def torchrun_resume(found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for way, apart in found["differences"].items():
+def torchrun_resume(result: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for way, apart in result["differences"].items():
         yield f"torchrun: {way}, largest difference from one process", f"{apart:.1e}"
 
 
@@ -109,15 +109,15 @@ def main() -> None:
     for name, reader in READERS.items():
         file = RESULTS / f"{name}.json"
         try:
-            found = json.loads(file.read_text())
-            rows = list(reader(found))
+            results = json.loads(file.read_text())
+            rows = list(reader(results))
         except FileNotFoundError:
             print(f"<!-- {file.name} is not there -->")
             continue
         except (LookupError, TypeError, ValueError) as problem:
             print(f"<!-- {file.name} cannot be read: {type(problem).__name__} {problem} -->")
             continue
-        machine = found.get("machine", found)
+        machine = results.get("machine", results)
         when = f"{machine.get('date', '')}, {machine.get('commit', '')}".strip(", ")
         where = f"{machine.get('cores', '?')} cores, {machine.get('processor', machine.get('device', '?'))}"
         for what, result in rows:

@@ -65,13 +65,13 @@ NUMBERS = {
 def cells(protocol: str, seeds: int) -> list[tuple[int, str, str]]:
     """Seed, effect in the set, renderer; all renderers on the set without effects, too."""
     knowing = [name for name, _ in EFFECTS.values()]
-    found = []
+    results = []
     for seed in range(seeds):
         for effect, (name, _) in EFFECTS.items():
-            found += [(seed, effect, one) for one in (knowing if effect == "none" else ["lambert", name])]
+            results += [(seed, effect, one) for one in (knowing if effect == "none" else ["lambert", name])]
     if protocol == "train":  # a fit has no such term
-        found += [(seed, "gloss", "phong(mean_diffuse=1.0)") for seed in range(seeds)]
-    return found
+        results += [(seed, "gloss", "phong(mean_diffuse=1.0)") for seed in range(seeds)]
+    return results
 
 
 def generated(effect: str, seed: int, count: int, size: int, first: int) -> Any:
@@ -105,8 +105,8 @@ def fitted_cell(effect: str, renderer: str, seed: int, given: argparse.Namespace
     model, drawn = derender.load("rendered-faces-64"), renderer_named(renderer)
     truth = generated(effect, seed, given.unseen, 64, 100_000)
     images = torch.from_numpy(truth.images).float() / 255
-    found = Scene.joined([fitted(model, drawn, batch, given.steps) for batch in images.split(32)])
-    return scores(found, drawn, truth, effect)
+    result = Scene.joined([fitted(model, drawn, batch, given.steps) for batch in images.split(32)])
+    return scores(result, drawn, truth, effect)
 
 
 @torch.inference_mode()
@@ -119,12 +119,14 @@ def scores(scene: Scene, drawn: Renderer, truth: Any, effect: str) -> dict[str, 
     normal = normals_from_depth(torch.where(plain.mask > 0, plain.depth, 1.1), 10.0)
     cosine = (normal * torch.from_numpy(truth.normal)).sum(dim=-1).clamp(-1, 1)
     inner = -torch.nn.functional.max_pool2d(-both[:, None], 3, 1, 1)[:, 0]
-    found, true, weight = plain.image, torch.from_numpy(truth.albedo).float() / 255, both[:, None]
-    scale = (found * true * weight).sum((1, 2, 3)) / (found.square() * weight).sum((1, 2, 3)).clamp(min=1e-6)
-    albedo = _mean((scale[:, None, None, None] * found - true).abs().mean(1), both) / _mean(
+    results, true, weight = plain.image, torch.from_numpy(truth.albedo).float() / 255, both[:, None]
+    scale = (results * true * weight).sum((1, 2, 3)) / (results.square() * weight).sum((1, 2, 3)).clamp(
+        min=1e-6
+    )
+    albedo = _mean((scale[:, None, None, None] * results - true).abs().mean(1), both) / _mean(
         true.mean(1), both
     )
-    chroma = [value / value.sum(1, keepdim=True).clamp(min=0.05) for value in (found, true)]
+    chroma = [value / value.sum(1, keepdim=True).clamp(min=0.05) for value in (results, true)]
     result = {
         "normal_deg": float(_mean(torch.rad2deg(cosine.acos()), inner).mean()),
         "albedo": float(albedo.mean()),
@@ -164,14 +166,14 @@ def yale(renderer: str, given: argparse.Namespace) -> dict[str, Any]:
     error = _mean((again.image - pixels).abs().mean(dim=1), again.mask).numpy()
     direction = (rotation_matrix(scene.camera[:, :3]) @ light_direction(scene.light)[:, :, None])[..., 0]
     x, y, z = direction.numpy().T
-    (azimuth, elevation), found = np.array(lights).T, np.degrees([np.arctan2(x, z), np.arcsin(y)])
+    (azimuth, elevation), results = np.array(lights).T, np.degrees([np.arctan2(x, z), np.arcsin(y)])
     angle = np.degrees(np.arccos(np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))))
     result: dict[str, Any] = {"images": len(error)}
     for low, high in ((0, 25), (25, 50), (50, 77.5)):
         rows = (angle >= low) & (angle < high)
         result |= {f"residual_{low}_{high:.0f}": float(error[rows].mean()), f"n_{low}": int(rows.sum())}
     rows = angle < 77.5
-    for kind, wanted, values in (("azimuth", azimuth, found[0]), ("elevation", elevation, found[1])):
+    for kind, wanted, values in (("azimuth", azimuth, results[0]), ("elevation", elevation, results[1])):
         result[f"{kind}_correlation"] = float(np.corrcoef(values[rows], wanted[rows])[0, 1])
         result[f"{kind}_mean_error_deg"] = float(np.abs(values - wanted)[rows].mean())
     return result

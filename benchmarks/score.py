@@ -38,8 +38,8 @@ def main() -> int:
         code = derender([*words, "--json", str(scores)])
         if code:
             return code
-        found = short(json.loads(scores.read_text()))
-    publish({"command": " ".join(["derender", *words]), **found}, file)
+        result = short(json.loads(scores.read_text()))
+    publish({"command": " ".join(["derender", *words]), **result}, file)
     return 0
 
 

@@ -60,11 +60,11 @@ def agreement(table: FeatureTable) -> None:
         rows = table.factors[factor]
         queries = rows[:5] + np.float32(0.01)
         for metric in ("cosine", "euclidean"):
-            found = [nearest(table, query, factor, FOUND, metric=metric) for query in queries]
+            results = [nearest(table, query, factor, FOUND, metric=metric) for query in queries]
             other = NearestNeighbors(n_neighbors=FOUND, metric=metric, algorithm="brute")
             distances, places = other.fit(rows.astype(np.float64)).kneighbors(queries.astype(np.float64))
-            assert np.array_equal([one for one, _ in found], places), f"other rows by {factor}, {metric}"
-            assert np.allclose([one for _, one in found], distances, atol=1e-7), (
+            assert np.array_equal([one for one, _ in results], places), f"other rows by {factor}, {metric}"
+            assert np.allclose([one for _, one in results], distances, atol=1e-7), (
                 f"other distances by {factor}"
             )
 

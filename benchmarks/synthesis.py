@@ -32,11 +32,11 @@ def digest(made: SyntheticSet) -> str:
 
 def check_threads(generate: Callable[..., SyntheticSet], threads: int) -> None:
     """Stop unless one thread makes the same bytes as all of them; the kernels are compiled on the way."""
-    found = set()
+    result = set()
     for number in (1, threads):
         torch.set_num_threads(number)
-        found.add(digest(generate(64, seed=3)))
-    assert len(found) == 1, "the bytes depend on the number of threads"
+        result.add(digest(generate(64, seed=3)))
+    assert len(result) == 1, "the bytes depend on the number of threads"
 
 
 def rounds_of(work: Callable[[int], object], count: int, rounds: int) -> dict[str, float | list[float]]:

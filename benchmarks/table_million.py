@@ -103,19 +103,19 @@ def measure(file: Path, rows: int, lists: int, looked_into: int) -> dict[str, An
 
     def timed(name: str, work: Callable[[], Any]) -> Any:
         began = time.perf_counter()
-        found = work()
+        result = work()
         seconds[name] = round(time.perf_counter() - began, 4)
-        return found
+        return result
 
     timed("write", lambda: write_table(file, rows))
     places = np.random.default_rng(0).permutation(min(rows, BLOCK))[:QUERIES]
     queries = next(factor_of(file))[places]
     index = timed("faiss_build", lambda: index_of(file, lists, looked_into))
-    found = timed("faiss_search", lambda: index.search(queries, NEIGHBOURS))[1]
+    result = timed("faiss_search", lambda: index.search(queries, NEIGHBOURS))[1]
     true = timed("exact_search", lambda: exact(file, queries))
     by_sql = timed("duckdb_nearest_one", lambda: nearest_by_sql(file, int(places[0])))
     counts = timed("duckdb_count", lambda: counts_by_sql(file))
-    recall = np.mean([len(np.intersect1d(a, b)) for a, b in zip(found, true, strict=True)]) / NEIGHBOURS
+    recall = np.mean([len(np.intersect1d(a, b)) for a, b in zip(result, true, strict=True)]) / NEIGHBOURS
     same = len({name for name, _ in by_sql} & {f"{row:08d}.jpg" for row in true[0]}) / NEIGHBOURS
     return {
         "rows": rows, "queries": len(queries), "neighbours": NEIGHBOURS, "lists": lists,

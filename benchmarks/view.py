@@ -116,18 +116,18 @@ def main() -> None:
                         pool.submit(visit, where["host"], where["port"], n, size, options.seconds, together)
                         for n in range(clients)
                     ]
-                    found = [one.result() for one in visits]
-                seconds = np.concatenate([one.seconds for one in found])
+                    results = [one.result() for one in visits]
+                seconds = np.concatenate([one.seconds for one in results])
                 row = {
                     "size": size,
                     "clients": clients,
                     "pictures_per_second": len(seconds) / options.seconds,
                     "pictures_per_cpu_second": len(seconds) / (cpu_seconds(server) - before),
-                    "slowest_client_per_second": min(len(one.seconds) for one in found) / options.seconds,
+                    "slowest_client_per_second": min(len(one.seconds) for one in results) / options.seconds,
                     "cpu_ms": 1e3 * (cpu_seconds(server) - before) / len(seconds),
                     "median_ms": float(np.median(seconds) * 1e3),
                     "p99_ms": float(np.quantile(seconds, 0.99) * 1e3),
-                    "refused": sum(one.refused for one in found),
+                    "refused": sum(one.refused for one in results),
                     "server_mb": memory_mb(server),
                 }
                 rows.append(row)

@@ -45,27 +45,27 @@ def table(name: str, keys: list[str] | None = None) -> str:
     """One table as Markdown, with a note: its file, and data that are not generated."""
     if name in SPEED:
         file, read = SPEED[name]
-        found = json.loads((RESULTS / file).read_text())
-        head, *rows = read(found)
+        result = json.loads((RESULTS / file).read_text())
+        head, *rows = read(result)
         lines = [head, ["---"] * len(head), *rows]
         note = f"`benchmarks/results/{file}`"
     else:
-        found = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
-        lines = [*body(found, keys or [column["key"] for column in found["columns"]])]
+        result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
+        lines = [*body(result, keys or [column["key"] for column in result["columns"]])]
         note = f"`benchmarks/results/tables/{name}.json`"
         kept = {False: "from its owners", True: "not published"}
         sets = [
-            f"{re.split(r' at |: |, ', x)[0]} ({kept['not published' in x]})" for x in found.get("needs", ())
+            f"{re.split(r' at |: |, ', x)[0]} ({kept['not published' in x]})" for x in result.get("needs", ())
         ]
         note += "; data: " + ", ".join(sets) if sets else ""
     shown = "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
     return f"{shown}\n\n{textwrap.fill(f'Source: {note}.', 118, break_on_hyphens=False)}\n"
 
 
-def body(found: Mapping[str, Any], keys: list[str]) -> Iterator[list[str]]:
+def body(result: Mapping[str, Any], keys: list[str]) -> Iterator[list[str]]:
     """Rows of cells: the head, the rule, the rows; the best of each column is bold."""
-    columns = {column["key"]: column for column in found["columns"]}
-    rows = [row for row in found["rows"] if not row.get("hidden") and any(key in row for key in keys)]
+    columns = {column["key"]: column for column in result["columns"]}
+    rows = [row for row in result["rows"] if not row.get("hidden") and any(key in row for key in keys)]
     yield ["", *(columns[key]["head"] for key in keys)]
     yield ["---"] * (len(keys) + 1)
     best = {key: best_of(columns[key], [row[key] for row in rows if key in row]) for key in keys}
@@ -81,9 +81,9 @@ def looked_up(reference: re.Match[str]) -> str:
     if name in SPEED:
         head, *rows = SPEED[name][1](json.loads((RESULTS / SPEED[name][0]).read_text()))
         return next(cells for cells in rows if cells[0] == row)[head.index(key)].split(" (")[0]
-    found = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
-    digits = next(column["digits"] for column in found["columns"] if column["key"] == key)
-    return cell(value_of(next(one for one in found["rows"] if one["name"] == row)[key]), digits, None)
+    result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
+    digits = next(column["digits"] for column in result["columns"] if column["key"] == key)
+    return cell(value_of(next(one for one in result["rows"] if one["name"] == row)[key]), digits, None)
 
 
 def value_of(entry: Any) -> float:
@@ -120,9 +120,9 @@ def edits(which: str, angles: dict[str, str]) -> Callable[[Any], Iterator[list[s
         "another person's ratio": "ratio of another person's photographs",
     }  # fmt: skip
 
-    def read(found: Any) -> Iterator[list[str]]:
+    def read(result: Any) -> Iterator[list[str]]:
         yield ["PSNR, dB / SSIM", *angles.values()]
-        for name, scores in found[which].items():
+        for name, scores in result[which].items():
             shown = (scores.get(angle) for angle in angles)
             cells = [
                 f"{psnr:.1f} / {ssim:.3f}" if psnr else "" for psnr, ssim in (s or (0, 0) for s in shown)
@@ -132,33 +132,33 @@ def edits(which: str, angles: dict[str, str]) -> Callable[[Any], Iterator[list[s
     return read
 
 
-def training_step(found: Any) -> Iterator[list[str]]:
+def training_step(result: Any) -> Iterator[list[str]]:
     yield ["step of preset `paper`, batch 64", "images/s", "slowest to fastest", "ratio", "GFLOP an image"]
-    for row in found["rows"]:
+    for row in result["rows"]:
         low, high = row["spread"]
         rate, ratio = f"{row['images_per_second']:.2f}", f"{row['ratio']:.2f}"
         yield [row["name"], rate, f"{low:.2f} to {high:.2f}", ratio, f"{row['gflop_per_image']:.1f}"]
 
 
-def rasterize(found: Any) -> Iterator[list[str]]:
+def rasterize(result: Any) -> Iterator[list[str]]:
     yield ["64 depth maps of 64 x 64, ms an image", "plain torch", "Numba", "ratio"]
-    for row in found["rows"]:
+    for row in result["rows"]:
         ms = row["ms_per_image"]
         yield [row["part"], f"{ms['reference']:.3f}", f"{ms['numba']:.3f}", f"{row['ratio']:.1f}"]
 
 
-def peers(found: Any) -> Iterator[list[str]]:
+def peers(result: Any) -> Iterator[list[str]]:
     yield [
         "16 depth maps, forward and backward, ms",
-        *(f"{row['size']} x {row['size']}" for row in found["rows"]),
+        *(f"{row['size']} x {row['size']}" for row in result["rows"]),
     ]
-    for name in found["rows"][0]["milliseconds"]:
-        yield [name, *(f"{row['milliseconds'][name]['both ways']:,.1f}" for row in found["rows"])]
+    for name in result["rows"][0]["milliseconds"]:
+        yield [name, *(f"{row['milliseconds'][name]['both ways']:,.1f}" for row in result["rows"])]
 
 
-def reading(found: Any) -> Iterator[list[str]]:
+def reading(result: Any) -> Iterator[list[str]]:
     yield ["", "first start, CPU s", "later starts, CPU s", "highest memory, MB"]
-    for name, kind in found["starts"].items():
+    for name, kind in result["starts"].items():
         later = ", ".join(f"{one['cpu_s']:.2f}" for one in kind["later"])
         first = kind["first"]
         yield [
@@ -169,43 +169,43 @@ def reading(found: Any) -> Iterator[list[str]]:
         ]
 
 
-def memory(found: Any) -> Iterator[list[str]]:
+def memory(result: Any) -> Iterator[list[str]]:
     yield ["images embedded", "highest memory, MB", "before the first image, MB", "CPU s"]
-    for row in found["rows"]:
+    for row in result["rows"]:
         yield [
             f"{row['pictures']:,}",
             *(f"{row[key]:,.0f}" for key in ("peak_mb", "before_mb", "cpu_seconds")),
         ]
 
 
-def step_memory(found: Any) -> Iterator[list[str]]:
+def step_memory(result: Any) -> Iterator[list[str]]:
     yield ["image size", "whole batch, MB", "four chunks, MB", "whole, CPU s", "four chunks, CPU s"]
     by_size: dict[int, dict[int, Any]] = {}
-    for row in found["rows"]:
+    for row in result["rows"]:
         by_size.setdefault(row["size"], {})[row["chunks"]] = row
     for size, rows in by_size.items():
         mb = [f"{rows[chunks]['step_mb']:,.0f}" for chunks in (1, 4)]
         yield [f"{size} pixels", *mb, *(f"{rows[chunks]['cpu_seconds']:.0f}" for chunks in (1, 4))]
 
 
-def million(found: Any) -> Iterator[list[str]]:
+def million(result: Any) -> Iterator[list[str]]:
     yield ["1,000,000 rows of 512", "seconds", "accuracy", "ARI with the drawn groups"]
-    for run in found["runs"]:
+    for run in result["runs"]:
         scores = run["scores"]["scores"]
         cells = (f"{scores[key]['value']:.3f}" for key in ("accuracy", "ari"))
         yield [run["method"], f"{run['seconds']:.0f}", *cells]
 
 
-def shares(found: Any) -> Iterator[list[str]]:
+def shares(result: Any) -> Iterator[list[str]]:
     yield ["median of five rounds", "ratio", "least to most", "images or rows a second"]
-    for row in found["rows"]:
+    for row in result["rows"]:
         speeds = f"{row['ours_per_second']:,.0f} / {row['theirs_per_second']:,.0f}"
         yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}", speeds]
 
 
-def compiled(found: Any) -> Iterator[list[str]]:
+def compiled(result: Any) -> Iterator[list[str]]:
     yield ["step, batch 16", "CPU ms", "compiled, CPU ms", "ratio", "least to most", "compiling, CPU s"]
-    for row in found["rows"]:
+    for row in result["rows"]:
         extras = ", bfloat16" if row["precision"] == "bf16-mixed" else ""
         spread = f"{row['least']:.2f} to {row['most']:.2f}"
         times = f"{row['eager_ms']:,.0f}", f"{row['compiled_ms']:,.0f}"
@@ -213,23 +213,23 @@ def compiled(found: Any) -> Iterator[list[str]]:
         yield [what, *times, f"{row['ratio']:.2f}", spread, f"{row['compiling_cpu_s']:.0f}"]
 
 
-def fitting(found: Any) -> Iterator[list[str]]:
-    yield [f"{found['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
-    before = 1000 * found["fit"]["portions_of_4_s"] / found["images"]
-    if "feed_forward_ms_per_image" in found["fit"]:
-        yield ["feed-forward", f"{found['fit']['feed_forward_ms_per_image']:.1f}"]
-    yield [f"optimised for {found['steps']} steps, portions of 64", f"{found['fit']['ms_per_image']:.1f}"]
-    yield [f"optimised for {found['steps']} steps, portions of four", f"{before:.1f}"]
+def fitting(result: Any) -> Iterator[list[str]]:
+    yield [f"{result['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
+    before = 1000 * result["fit"]["portions_of_4_s"] / result["images"]
+    if "feed_forward_ms_per_image" in result["fit"]:
+        yield ["feed-forward", f"{result['fit']['feed_forward_ms_per_image']:.1f}"]
+    yield [f"optimised for {result['steps']} steps, portions of 64", f"{result['fit']['ms_per_image']:.1f}"]
+    yield [f"optimised for {result['steps']} steps, portions of four", f"{before:.1f}"]
 
 
 def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[[Any], Iterator[list[str]]]:
     """Rows of a protocol: for each head the score, what it is multiplied by, and its digits."""
 
-    def read(found: Any) -> Iterator[list[str]]:
+    def read(result: Any) -> Iterator[list[str]]:
         for key in where:
-            found = found[key]
+            result = result[key]
         yield ["", *columns]
-        for name, row in found.items():
+        for name, row in result.items():
             note = " (control)" if row["control"] else ""
             yield [name + note, *(shown(row["scores"].get(key), by, n) for key, by, n in columns.values())]
 
@@ -243,9 +243,9 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
     return read
 
 
-def renderers(found: Any) -> Iterator[list[str]]:
+def renderers(result: Any) -> Iterator[list[str]]:
     """Reconstruction error of scenes optimised with each renderer, by effect, mean over seeds."""
-    cells = found["cells"]
+    cells = result["cells"]
     names = list(dict.fromkeys(one["renderer"] for one in cells))
     yield ["effect in the images; L1 with", *names]
     for effect in dict.fromkeys(one["effect"] for one in cells):
@@ -256,19 +256,19 @@ def renderers(found: Any) -> Iterator[list[str]]:
         yield [effect, *means]
 
 
-def renderer_speed(found: Any) -> Iterator[list[str]]:
+def renderer_speed(result: Any) -> Iterator[list[str]]:
     yield ["renderer", "forward, ms", "with gradients, ms", "with gradients / lambert"]
-    for one in found["cells"]:
+    for one in result["cells"]:
         cells = (("forward_ms", 1), ("forward_and_backward_ms", 1), ("forward_and_backward_over_lambert", 2))
         yield [one["renderer"], *(f"{one[key]:.{digits}f}" for key, digits in cells)]
 
 
-def renderers_trained(found: Any, clear: bool = False) -> Iterator[list[str]]:
+def renderers_trained(result: Any, clear: bool = False) -> Iterator[list[str]]:
     """Errors of models trained with each renderer, by effect or of ``clear`` images: mean, deviation."""
     digits = {"normal_deg": 1, "albedo": 3, "albedo_chroma": 4, "l1": 4}
     titles = ("normals, degrees", "albedo error", "chroma error", "L1", "albedo / lambert", "seeds")
     yield ["effect in the images: renderer", *titles]
-    groups = _trained(found)
+    groups = _trained(result)
     for effect, name in [pair for pair in groups if (pair[0] == "none") == clear]:
         ones = groups[effect, name]
         means = [_spread([one[key] for one in ones], n) for key, n in digits.items()]
@@ -277,21 +277,21 @@ def renderers_trained(found: Any, clear: bool = False) -> Iterator[list[str]]:
         yield [f"{effect}: {name}", *means, ratio, ", ".join(str(one["seed"]) for one in ones)]
 
 
-def effect_numbers(found: Any) -> Iterator[list[str]]:
+def effect_numbers(result: Any) -> Iterator[list[str]]:
     """Rank correlation and median errors of an effect's own numbers in trained models."""
     yield ["number, renderer", "rank correlation", "median error", "after the best line", "of a constant"]
     ends = ("spearman", "median_error", "median_error_of_line", "median_error_of_constant")
-    for (_, name), ones in _trained(found).items():
+    for (_, name), ones in _trained(result).items():
         for number in [key.removesuffix("_spearman") for key in ones[0] if key.endswith("_spearman")]:
             means = (_spread([one[f"{number}_{end}"] for one in ones], 2) for end in ends)
             yield [f"{number.replace('_', ' ')}: {name}", *means]
 
 
-def _trained(found: Any) -> dict[tuple[str, str], list[Any]]:
+def _trained(result: Any) -> dict[tuple[str, str], list[Any]]:
     """Cells of every seed by effect and renderer, in the order of a table."""
     groups: dict[tuple[str, str], list[Any]] = {}
     order = ["none", "shadows", "gloss", "lamps", "haze"]
-    for one in sorted(found["cells"], key=lambda one: (order.index(one["effect"]), one["seed"])):
+    for one in sorted(result["cells"], key=lambda one: (order.index(one["effect"]), one["seed"])):
         groups.setdefault((one["effect"], one["renderer"]), []).append(one)
     return groups
 
@@ -301,42 +301,42 @@ def _spread(values: list[float], digits: int) -> str:
     return text if len(values) < 2 else f"{text} ± {stdev(values):.{digits}f}"
 
 
-def renderers_yale(found: Any) -> Iterator[list[str]]:
+def renderers_yale(result: Any) -> Iterator[list[str]]:
     """Residuals by the light's angle, and its azimuth and elevation, of scenes fitted to Extended Yale B."""
     residuals = {"L1 to 25°": "0_25", "25° to 50°": "25_50", "50° to 77°": "50_78"}
     yield ["renderer", *residuals, *(f"{what}: r, error" for what in ("azimuth", "elevation"))]
-    for one in found["cells"]:
+    for one in result["cells"]:
         shown = [f"{one[f'residual_{span}']:.4f}" for span in residuals.values()]
         for what in ("azimuth", "elevation"):
             shown.append(f"{one[f'{what}_correlation']:.3f}, {one[f'{what}_mean_error_deg']:.1f}°")
         yield [one["renderer"], *shown]
 
 
-def million_rows(found: Any) -> Iterator[list[str]]:
+def million_rows(result: Any) -> Iterator[list[str]]:
     yield ["1,000,000 rows of 128, one thread", "seconds"]
     names = {
-        "faiss_build": f"FAISS, index of {found['lists']:,} cells",
-        "faiss_search": f"FAISS, {found['queries']} queries, recall {found['recall']}",
-        "exact_search": f"exact, {found['queries']} queries",
+        "faiss_build": f"FAISS, index of {result['lists']:,} cells",
+        "faiss_search": f"FAISS, {result['queries']} queries, recall {result['recall']}",
+        "exact_search": f"exact, {result['queries']} queries",
         "duckdb_nearest_one": "DuckDB, one exact query",
         "duckdb_count": "DuckDB, rows of each kind",
     }
-    yield from ([name, f"{found['seconds'][key]:.2f}"] for key, name in names.items())
+    yield from ([name, f"{result['seconds'][key]:.2f}"] for key, name in names.items())
 
 
-def true_factors(found: Any) -> Iterator[list[str]]:
-    model, untrained = (found["rows"][name][0]["truth"] for name in ("model", "untrained encoder"))
+def true_factors(result: Any) -> Iterator[list[str]]:
+    model, untrained = (result["rows"][name][0]["truth"] for name in ("model", "untrained encoder"))
     yield ["true factor", *model["features"], "untrained, all"]
     for place, name in enumerate(model["factors"]):
         scores = (row[place] for row in (*model["score"], untrained["together"]))
         yield [name, *(f"{round(score, 2) + 0:.2f}" for score in scores)]
 
 
-def disentangled(found: Any) -> Iterator[list[str]]:
+def disentangled(result: Any) -> Iterator[list[str]]:
     """Similarity between factors and the swap test, of the model and each control."""
     columns = ("Pearson per dimension", "CKA", "cross R2", "swap test, features", "swap test, decoded")
     yield ["", *columns]
-    for name, (row, *_) in found["rows"].items():
+    for name, (row, *_) in result["rows"].items():
         alike, swap = row["similarity"] or {}, row["swap"] or {}
         values = [
             (row["pearson"]["mean_per_dimension"], 3), (alike.get("mean_cka_unbiased"), 3),
@@ -346,9 +346,9 @@ def disentangled(found: Any) -> Iterator[list[str]]:
         yield [label, *("" if value is None else f"{value:.{digits}f}" for value, digits in values)]
 
 
-def swapped(found: Any) -> Iterator[list[str]]:
+def swapped(result: Any) -> Iterator[list[str]]:
     """How far each feature moves towards its donor's where one factor was exchanged."""
-    swap = found["rows"]["model"][0]["swap"]
+    swap = result["rows"]["model"][0]["swap"]
     yield ["", *swap["factors"]]
     for name, row in zip(swap["factors"], swap["moved"], strict=True):
         yield [f"{name} exchanged", *(f"{value:.2f}" for value in row)]
@@ -356,28 +356,28 @@ def swapped(found: Any) -> Iterator[list[str]]:
     yield ["nothing exchanged, rendered and encoded again", *unexchanged]
 
 
-def page_speed(found: Any) -> Iterator[list[str]]:
+def page_speed(result: Any) -> Iterator[list[str]]:
     yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
-    for row in found["rows"]:
+    for row in result["rows"]:
         cells = (row[key] for key in ("pictures_per_cpu_second", "cpu_ms", "server_mb"))
         yield [f"{row['size']} pixels, {row['clients']}", *(f"{cell:,.0f}" for cell in cells)]
 
 
-def aligned(found: Any) -> Iterator[list[str]]:
+def aligned(result: Any) -> Iterator[list[str]]:
     yield ["faces found", "recall", "precision", "eye error, mean", "90th percentile"]
     for group in ("pasted", "lfw crops"):
-        for name, row in found[group].items():
+        for name, row in result[group].items():
             keys = ("recall", "precision", "eye_error_mean", "eye_error_90th")
             yield [f"{group}: {name}", *(f"{row[key]:.3f}" for key in keys)]
 
 
-def angles(found: Any) -> Iterator[list[str]]:
+def angles(result: Any) -> Iterator[list[str]]:
     """Correlation, slope and error of each angle, beside the error of a constant answer."""
     yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
     for name in ("yaw", "pitch", "roll", "azimuth", "elevation"):
-        if name in found:
-            model = {key: score["value"] for key, score in found[name]["model"]["scores"].items()}
-            control = found[name]["constant answer"]["scores"]["error"]["value"]
+        if name in result:
+            model = {key: score["value"] for key, score in result[name]["model"]["scores"].items()}
+            control = result[name]["constant answer"]["scores"]["error"]["value"]
             cells = [f"{model[key]:.3f}" for key in ("r", "slope")] + [f"{model['error']:.1f}"]
             yield [name, *cells, f"{control:.1f}"]
 
@@ -426,7 +426,7 @@ SPEED: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "renderers": ("renderers_fit.json", renderers),
     "renderers-speed": ("renderers_speed.json", renderer_speed),
     "renderers-train": ("renderers_train.json", renderers_trained),
-    "renderers-clear": ("renderers_train.json", lambda found: renderers_trained(found, clear=True)),
+    "renderers-clear": ("renderers_train.json", lambda result: renderers_trained(result, clear=True)),
     "renderers-numbers": ("renderers_train.json", effect_numbers),
     "renderers-yale": ("renderers_yaleb.json", renderers_yale),
     "table-million": ("table_million.json", million_rows),

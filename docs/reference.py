@@ -110,11 +110,11 @@ def setting_tables() -> Iterator[str]:
 
 
 def flat(settings: BaseModel, before: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name in type(settings).model_fields:
         value = getattr(settings, name)
-        found |= flat(value, f"{before}{name}.") if isinstance(value, BaseModel) else {before + name: value}
-    return found
+        result |= flat(value, f"{before}{name}.") if isinstance(value, BaseModel) else {before + name: value}
+    return result
 
 
 def rows_of(settings: BaseModel, before: str, seen: set[str]) -> Iterator[str]:
@@ -133,7 +133,7 @@ def rows_of(settings: BaseModel, before: str, seen: set[str]) -> Iterator[str]:
 
 def comments_of(kind: type) -> dict[str, str]:
     """The comment on the line of each field, of the class and of those it is made from."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for one in reversed(
         [base for base in kind.__mro__ if issubclass(base, BaseModel) and base is not BaseModel]
     ):
@@ -153,5 +153,5 @@ def comments_of(kind: type) -> dict[str, str]:
                     ),
                     "",
                 )
-                found[node.target.id] = text
-    return found
+                result[node.target.id] = text
+    return result

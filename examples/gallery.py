@@ -109,8 +109,8 @@ def search(data: str, work: Path) -> None:
     table, pixels = derender.embed(data, model, fit_steps=0), colours.pictures(truth.images)
     for factor in ("geometry", "light"):
         query = len(truth) // 2
-        found = derender.search(table, like=truth.files[query], model=model, factor=factor, k=7)
-        rows = [query, *(truth.files.index(file) for file in found.files)]
+        match = derender.search(table, like=truth.files[query], model=model, factor=factor, k=7)
+        rows = [query, *(truth.files.index(file) for file in match.files)]
         captions = [f"light {side(np.degrees(truth.light[row, 3]))}" for row in rows]
         captions[0] = f"query, {captions[0]}"
         sheet = contact_sheet(

@@ -241,10 +241,10 @@ def spherical_kmeans(
         centres = torch.cat([centres, rows[drawn]])
     assigned = torch.full((len(rows),), -1, device=rows.device)
     for _ in range(50):
-        cosine, found = (rows @ centres.T).max(dim=1)
-        if torch.equal(found, assigned):
+        cosine, result = (rows @ centres.T).max(dim=1)
+        if torch.equal(result, assigned):
             break
-        assigned = found
+        assigned = result
         sums = torch.zeros_like(centres).index_add_(0, assigned, rows)
         empty = torch.bincount(assigned, minlength=clusters) == 0
         sums[empty] = rows[cosine.argsort()[: int(empty.sum())]]

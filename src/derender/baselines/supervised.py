@@ -165,12 +165,12 @@ def encode_labels(
 
 def accuracy(model: Resnet18, images: ImageSet) -> dict[str, float]:
     """By ``accuracy LABEL``: share of right answers where the label is known, 0 to 1; NaN if nowhere."""
-    found = {}
+    results = {}
     batches = map_batches(model.label_logits, model, images.images, batch_size=256)
     for (label, names), parts in zip(model.settings.classes.items(), zip(*batches, strict=True), strict=True):
         values = images.label(label)
         known = ~missing(values)
         best = np.array(names)[torch.cat(parts).argmax(dim=1).cpu().numpy()]
         right = best[known] == values[known].astype(str)
-        found[f"accuracy {label}"] = float(right.mean()) if known.any() else float("nan")
-    return found
+        results[f"accuracy {label}"] = float(right.mean()) if known.any() else float("nan")
+    return results

@@ -35,23 +35,23 @@ def demo(
                 "report": lambda stage, done, total, note: report(done, total, note, description=stage),
                 "opened": lambda page: notice(f"open {page} now: it fills in while a model trains"),
             }
-            settings, told = QUICK if quick else FULL, None
+            settings, story = QUICK if quick else FULL, None
             if images is not None:
                 run_own_demo(images, folder, settings, **how)
             else:
-                told = run_demo(folder, settings, **how)
-                demo_page(told).write(folder / "report.html")
+                story = run_demo(folder, settings, **how)
+                demo_page(story).write(folder / "report.html")
     except TrainingInterrupted as stop:
         raise KeyboardInterrupt(
             f"stopped; run derender demo again to start over ({folder} can be deleted)"
         ) from stop
-    if told is not None:
-        for name, table in score_tables(told).items():
+    if story is not None:
+        for name, table in score_tables(story).items():
             show_scores(table, json_file)
             result("", json_file)
             values[name] = table.values()
-        values |= {"run": told.trained, "seconds": told.seconds}
-        for finding in told.trained.findings:
+        values |= {"run": story.trained, "seconds": story.seconds}
+        for finding in story.trained.findings:
             notice(f"{finding.sign}: {finding.text}; {finding.advice}")
     notice(f"done in {duration(time.monotonic() - began)}; the model is in {folder / 'run'}")
     result(f"report {folder / 'report.html'}", json_file)

@@ -27,24 +27,24 @@ def doctor(
     from derender.data.doctor import doctor as examine
 
     with progress_bar("examining") as report:
-        found = examine(image_set.address, **image_set.how, seed=seed, progress=report)
-    notice(found.images.describe())
-    for row in found.images.skipped[:NAMED]:
+        result = examine(image_set.address, **image_set.how, seed=seed, progress=report)
+    notice(result.images.describe())
+    for row in result.images.skipped[:NAMED]:
         notice(f"unreadable: {row.file}: {row.reason}")
-    if (more := len(found.images.skipped) - NAMED) > 0:
+    if (more := len(result.images.skipped) - NAMED) > 0:
         notice(f"and {more:,} more unreadable files (--json names all)")
-    for finding in sorted(found.findings, key=lambda one: list(WORDS).index(one.level)):
+    for finding in sorted(result.findings, key=lambda one: list(WORDS).index(one.level)):
         advice = f" {finding.advice}" if finding.advice else ""
         output.result(f"{WORDS[finding.level]:>4}  {finding.name}: {finding.text}{advice}")
-    output.result(f"verdict: {found.verdict.text}")
-    values = found.as_json()
+    output.result(f"verdict: {result.verdict.text}")
+    values = result.as_json()
     if out is not None:
         from derender.report.doctor import doctor_page
 
-        values["report"] = doctor_page(found).write(out)
+        values["report"] = doctor_page(result).write(out)
         output.result(f"report {out}")
     else:
         notice("add --out doctor.html for a page with example images")
     output.write(values)
-    if check and found.verdict.word == "does not suit":
+    if check and result.verdict.word == "does not suit":
         raise typer.Exit(1)

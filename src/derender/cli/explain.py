@@ -49,15 +49,15 @@ def explain(
     from derender.report.explanation import write_explanation
 
     with progress_bar("explaining", "") as report:
-        found = derender.explain(
+        results = derender.explain(
             images.address, model.model, label or (), **images.how, **vars(asked), device=model.device,
             progress=lambda stage: lambda done, total: report(done, total, description=stage),
         )  # fmt: skip
-    report_images(found.images)
+    report_images(results.images)
     if out is None:
         notice("add --out DIR for the page, the chart and maps over images")
     else:
         with progress_bar("drawing maps", "labels") as report:
-            found = write_explanation(found, out, sheets=sheets, rows=rows, progress=report)
+            results = write_explanation(results, out, sheets=sheets, rows=rows, progress=report)
         result(f"report {out / 'explain.html'}", published.json_file)
-    published.publish(replace(found.scores, values={**found.scores.values, "out": out}))
+    published.publish(replace(results.scores, values={**results.scores.values, "out": out}))

@@ -42,14 +42,14 @@ def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
     if out is None:
         raise ValueError("--plan needs --out DIR: a folder for runs, tables and images")
     how = {"workers": planned.workers, "minutes": planned.minutes, "device": device}
-    found = learn.compare_plan(plan, out, tell=notice, bar=progress_bar, **how)
-    for table in found.tables:
+    results = learn.compare_plan(plan, out, tell=notice, bar=progress_bar, **how)
+    for table in results.tables:
         show_scores(table, json_file)
     for state in ("failed", "missing"):
-        for sentence in found.values[state]:
+        for sentence in results.values[state]:
             notice(f"{state}: {sentence}")
-    if found.values["missing"]:
+    if results.values["missing"]:
         notice("the budget is used; the same command continues where it stopped")
-    for written in found.values["files"]:
+    for written in results.values["files"]:
         result(str(written), json_file)
-    write_json(json_file, found.values)
+    write_json(json_file, results.values)

@@ -175,20 +175,20 @@ def numbers_of(text: str, option: str) -> tuple[int, ...]:
 
 def named_paths(values: Sequence[str], option: str) -> dict[str, list[str]]:
     """``NAME=PATH`` options by name, in order; a path alone is named after its last part."""
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for value in values:
         name, equals, path = value.partition("=")
         if not equals:
             name, path = Path(value).stem or value, value
         if not name or not path:
             raise ValueError(f"{option} {value!r} should read NAME=PATH")
-        found.setdefault(name, []).append(path)
-    return found
+        result.setdefault(name, []).append(path)
+    return result
 
 
 def single_paths(values: Sequence[str], option: str) -> dict[str, str]:
     """The same where each name is given once."""
-    found = named_paths(values, option)
-    if twice := [name for name, paths in found.items() if len(paths) > 1]:
+    result = named_paths(values, option)
+    if twice := [name for name, paths in result.items() if len(paths) > 1]:
         raise ValueError(f"two models have the name {twice[0]!r}: give each its own")
-    return {name: path for name, (path,) in found.items()}
+    return {name: path for name, (path,) in result.items()}

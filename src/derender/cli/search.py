@@ -33,36 +33,36 @@ def search(
     from derender.report.search_sheet import search_sheet
 
     how = {"metric": metric, "model": model, "copies": copies, "device": device}
-    found = derender.search(features, like, factor, k, **how)
-    files = found.table.files
+    match = derender.search(features, like, factor, k, **how)
+    files = match.table.files
     near = [
-        {"row": row, "file": files[row], "distance": distance, "labels": found.labels(row)}
-        for row, distance in zip(found.rows, found.distances, strict=True)
+        {"row": row, "file": files[row], "distance": distance, "labels": match.labels(row)}
+        for row, distance in zip(match.rows, match.distances, strict=True)
     ]
-    shown = [name for name in found.table.labels if name != "partition"][:LABELS_SHOWN]
+    shown = [name for name in match.table.labels if name != "partition"][:LABELS_SHOWN]
     columns = (Column("distance", digits=4), *map(Column, shown))
     rows = [
         Row(one["file"], (one["distance"], *(str(one["labels"][name]) for name in shown))) for one in near
     ]
-    caption = f"nearest to {like} by {factor}, {metric} distance, in {features} ({len(found.table):,} rows)"
+    caption = f"nearest to {like} by {factor}, {metric} distance, in {features} ({len(match.table):,} rows)"
     show_scores(ScoreTable(caption, "file", columns, rows), output.json_file)
-    if found.unchecked:
+    if match.unchecked:
         notice(f"{features} does not record which model made it: cannot check that it was {model}")
     if len(rows) < k:
         notice(f"the table has no more than {len(rows):,} {'rows' if copies else 'other rows'}")
-    others = [] if copies else [files[row] for row in found.same_image if row != found.own_row]
+    others = [] if copies else [files[row] for row in match.same_image if row != match.own_row]
     if others:
         more = f" and {len(others) - 1:,} more" if len(others) > 1 else ""
         notice(f"left out as the very same image: {others[0]}{more} (--copies finds it)")
     if out is not None:
         with progress_bar("finding images") as report:
-            for name in search_sheet(found, out, data, dataset=dataset, progress=report):
+            for name in search_sheet(match, out, data, dataset=dataset, progress=report):
                 notice(f"left out of the sheet: {name} cannot be read")
         notice(f"drawn in {out}")
     output.write(
         {
             "like": like, "factor": factor, "metric": metric, "table": features, "out": out,
-            "same_picture": [files[row] for row in found.same_image],
+            "same_picture": [files[row] for row in match.same_image],
             "found": near,
         }
     )  # fmt: skip

@@ -52,11 +52,11 @@ def read_cache(
                 return None
             stream.seek(end - length)
             note = json.loads(stream.read(length))
-        found, checksum, content = note["fingerprint"], note["checksum"], note["content"]
+        result, checksum, content = note["fingerprint"], note["checksum"], note["content"]
         count = len(content["files"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
-    if found != fingerprint or end - length != count * 3 * image_size * image_size or not count:
+    if result != fingerprint or end - length != count * 3 * image_size * image_size or not count:
         return None
     images = np.memmap(file, np.uint8, mode="c", shape=(count, 3, image_size, image_size))
     return (images, content) if sample_checksum(images) == checksum else None

@@ -153,11 +153,11 @@ class ImageSet:
     def require(self, minimum: int, purpose: str = "training") -> "ImageSet":
         """The set itself if it holds enough images; otherwise an error that says so."""
         if len(self) < minimum:
-            found = "only one image was" if len(self) == 1 else f"only {len(self)} images were"
+            result = "only one image was" if len(self) == 1 else f"only {len(self)} images were"
             left_out = len(self.skipped) + len(self.duplicates)
             note = f" ({left_out} more were unreadable or identical copies)" if left_out else ""
             raise ValueError(
-                f"{purpose} needs {minimum:,} images or more, and {found} found "
+                f"{purpose} needs {minimum:,} images or more, and {result} found "
                 f"in {self.source}{note}; add images"
             )
         return self
@@ -219,17 +219,17 @@ def read_images(
         closing(decoded(stream, image_size, fit=fit, workers=workers)) as chunks,
         quiet_pillow(),
     ):
-        found = _Found(keep_duplicates)
+        result = _Found(keep_duplicates)
 
         def kept() -> Iterator[np.ndarray]:
             """Decode everything, note it in ``found``, and yield the rows."""
             for chunk in chunks:
-                yield chunk.images[found.add(chunk)]
+                yield chunk.images[result.add(chunk)]
                 if progress is not None:
                     done = chunk.start + len(chunk)
                     progress(done, estimated_total(done, chunk.share, stream.limit))
-            if not found.files:
-                where, skipped = f"{stream.source} ({stream.layout})", found.skipped
+            if not result.files:
+                where, skipped = f"{stream.source} ({stream.layout})", result.skipped
                 first = f"the first is {skipped[0].file!r}: {skipped[0].reason}" if skipped else ""
                 none = f"none of the {len(skipped):,} images in {where} can be read; {first}"
                 raise ValueError(none if skipped else f"no image in {where}: it is empty")
@@ -238,8 +238,8 @@ def read_images(
         if cache is None and count is not None and count * 3 * image_size**2 <= memory_limit_bytes:
             images = np.empty((count, 3, image_size, image_size), np.uint8)
             for rows in kept():
-                images[len(found.files) - len(rows) : len(found.files)] = rows
-            return _joined(stream, images[: len(found.files)], found.content())
+                images[len(result.files) - len(rows) : len(result.files)] = rows
+            return _joined(stream, images[: len(result.files)], result.content())
         settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
         made_of = repr((settings, PIL.__version__, stream.identity()))
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
@@ -248,7 +248,7 @@ def read_images(
         folder = cache_folder() if cache is None else Path(cache)
         file = folder / f"{name}-{told_apart.hexdigest()[:16]}.pictures"
         if (cached := read_cache(file, fingerprint, image_size)) is None:
-            write_cache(file, fingerprint, image_size, kept(), found.content)
+            write_cache(file, fingerprint, image_size, kept(), result.content)
             if (cached := read_cache(file, fingerprint, image_size)) is None:
                 raise OSError(f"decoded images could not be read back from {file}; check the disk")
         if progress is not None:
@@ -323,5 +323,5 @@ def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> I
         labels, partition = table.labels, table.partition
     skipped = (*stream.passed_over, *(Skipped(**row) for row in content["skipped"]))
     copies = tuple(Duplicate(**row) for row in content["duplicates"])
-    found = (images, files, labels, stream.layout, skipped, copies, partition)
-    return ImageSet(*found, source=stream.source, terms=stream.terms)
+    result = (images, files, labels, stream.layout, skipped, copies, partition)
+    return ImageSet(*result, source=stream.source, terms=stream.terms)

@@ -106,7 +106,7 @@ def read_masks(
         names = images.label("mask").tolist() if own else _named_alike(files, images.files)
         _require_masks(files, images.files, names)
         parts = parts_of(files) if own else {}
-        found = np.empty((len(images), image_size, image_size), np.uint8)
+        result = np.empty((len(images), image_size, image_size), np.uint8)
 
         def load(row: int) -> None:
             name = names[row]
@@ -120,13 +120,13 @@ def read_masks(
                         f"{width} x {height}: a mask has the aspect ratio of its image"
                     )
             square = fit_square(Image.fromarray(mask), image_size, fit, Image.Resampling.NEAREST, 0)
-            found[row] = np.asarray(square)
+            result[row] = np.asarray(square)
 
         with ThreadPoolExecutor(workers or usable_cores()) as pool, quiet_pillow():
             for done, _ in enumerate(pool.map(load, range(len(images))), 1):
                 if progress is not None:
                     progress(done, len(images))
-        return MaskedImages(images, found, MASK_CLASSES if own else _class_names(files, found, names))
+        return MaskedImages(images, result, MASK_CLASSES if own else _class_names(files, result, names))
 
 
 def read_ground_truth(

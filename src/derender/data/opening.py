@@ -289,12 +289,12 @@ def _only_part(source: str | Path, part: str | None, subset: str | None) -> str 
 def _nothing_found(files: Source) -> str:
     """What was looked for, where, and what lies there instead."""
     kinds = Counter(PurePosixPath(file).suffix.lower() or "no suffix" for file in files.files)
-    found = ", ".join(f"{count:,} of {kind}" for kind, count in kinds.most_common(5)) or "no files at all"
+    result = ", ".join(f"{count:,} of {kind}" for kind, count in kinds.most_common(5)) or "no files at all"
     hint = "; to read an archive in it, name that file itself" if ".zip" in kinds else ""
     if files.skipped:
         first = files.skipped[0]
         hint += f"; passed over {len(files.skipped):,}, the first is {first.file!r}: {first.reason}"
-    return f"no images found in {files.path}: looked for {' '.join(SUFFIXES)}; found {found}{hint}"
+    return f"no images found in {files.path}: looked for {' '.join(SUFFIXES)}; found {result}{hint}"
 
 
 def _kind_of(path: Path, written: str) -> str | None:

@@ -142,8 +142,8 @@ def find_shards(path: Path, source: str, part: str | None = None) -> list[Path]:
     Of a part ``train`` are those called train-000.tar, and those in a folder of that name.
     """
     if path.is_dir():
-        found = (one for one in path.rglob("*") if one.name.endswith(SHARD_SUFFIXES) and one.is_file())
-        if not (shards := sorted(found)):
+        result = (one for one in path.rglob("*") if one.name.endswith(SHARD_SUFFIXES) and one.is_file())
+        if not (shards := sorted(result)):
             raise ValueError(f"{path} holds no shards ({' '.join(SHARD_SUFFIXES)})")
     else:
         shards = [path] if path.exists() else [Path(name) for name in expand_braces(str(path))]

@@ -159,8 +159,8 @@ class FolderSource(FileSource):
 
 def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:
     """Size and time of change in nanoseconds of files on disk."""
-    found = [path.stat() for path in paths]
-    return np.array([(one.st_size, one.st_mtime_ns) for one in found], np.int64).reshape(-1, 2)
+    results = [path.stat() for path in paths]
+    return np.array([(one.st_size, one.st_mtime_ns) for one in results], np.int64).reshape(-1, 2)
 
 
 def is_image(file: str) -> bool:

@@ -56,8 +56,8 @@ def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> d
             error = weights @ np.abs(predicted - true - offset) / total
             return r, covariance / true_spread, error, weights @ (predicted - true) / total
 
-    found = scores(np.concatenate((np.ones((1, len(true))), weights)))  # first every row once
-    return {name: estimate(own[:1], own[1:]) for name, own in zip(AGREEMENT, found, strict=True)}
+    result = scores(np.concatenate((np.ones((1, len(true))), weights)))  # first every row once
+    return {name: estimate(own[:1], own[1:]) for name, own in zip(AGREEMENT, result, strict=True)}
 
 
 def agreement_table(
@@ -124,7 +124,7 @@ def _angles(
     true, read = known_angles(how.at(model.image_size), table, labels)
     nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
 
-    found = {}
+    results = {}
     for name, net in nets.items():
 
         def see(batch: Tensor, net: Any = net) -> np.ndarray:
@@ -134,18 +134,18 @@ def _angles(
             return angles.double().numpy(force=True)
 
         parts = map_batches(see, net, read.images, batch_size=64, progress=how.stage(name))
-        found[name] = np.concatenate(parts)
+        results[name] = np.concatenate(parts)
     people = read.labels.get("identity", np.array(read.files))
     weights = group_resamples(people.astype(str), how.resamples, how.seed)
     tables: list[ScoreTable] = []
     values: dict[str, Any] = {"pictures": len(read)}
     for column, name in enumerate(labels):
-        answers = {row: angles[:, column] for row, angles in found.items()}
+        answers = {row: angles[:, column] for row, angles in results.items()}
         caption = f"{what}: {name} in degrees, {len(read):,} images"
         shown, values[name] = agreement_table(caption, answers, true[:, column], weights)
         tables.append(shown)
     if what == "Light":
-        rows, columns = _directions(found, true, people.astype(str), how)
+        rows, columns = _directions(results, true, people.astype(str), how)
         caption = "Light: degrees between true and predicted direction, by the angle between light and view"
         tables.append(scored_table(caption, "prediction", rows, columns, deviations=()))
         values["direction"] = numbers_of(rows)
@@ -153,11 +153,11 @@ def _angles(
 
 
 def _directions(
-    found: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
+    result: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
 ) -> tuple[Sequence[ScoredRow], Mapping[str, Column]]:
     """Angle between true and predicted direction, all and by the angle between light and view."""
     aim = _unit(true)
-    answers = {name: _unit(angles) for name, angles in found.items()}
+    answers = {name: _unit(angles) for name, angles in result.items()}
     answers["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
     off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
     apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in answers.items()}

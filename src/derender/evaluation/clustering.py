@@ -81,27 +81,27 @@ def cluster(
     rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
     ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)
-    found = compare_clusterings(
+    result = compare_clusterings(
         ready.features, ready.labels, controls=ready.controls, method=method, n_clusters=clusters,
         resample_count=how.resamples, seed=how.seed, memory=how.memory,
     )  # fmt: skip
     caption = "Above the strongest control? (paired resamples of the rows)"
-    tables = [clustering_table(found), verdict_table(found.rows, CLUSTER_COLUMNS, caption)]
+    tables = [clustering_table(result), verdict_table(result.rows, CLUSTER_COLUMNS, caption)]
     levels = {}
     if method == "finch" and len(names) == 1:
         for row in rows:
             levels[row.name] = finch_levels(ready.features[row.name][0], ready.labels[names[0]], how.memory)
-            tables.append(finch_table(row.name, levels[row.name], found.labels[names[0]]))
-    approximate = approximation(method, found.n_rows)
-    notes = [*how.notes, *left_out, verdict(found.rows[0], "accuracy"), *filter(None, [approximate])]
+            tables.append(finch_table(row.name, levels[row.name], result.labels[names[0]]))
+    approximate = approximation(method, result.n_rows)
+    notes = [*how.notes, *left_out, verdict(result.rows[0], "accuracy"), *filter(None, [approximate])]
     if ready.n_dropped:
         why = f"without a label of {', '.join((*names, *mean_by))}"
         if min_count > 1 or max_count:
             why += f", or beyond {min_count} to {max_count or 'all'} rows of a class"
         notes.append(f"{ready.n_dropped:,} rows {why} left out")
-        found = replace(found, n_dropped=found.n_dropped + ready.n_dropped)
+        result = replace(result, n_dropped=result.n_dropped + ready.n_dropped)
     more = {"approximation": approximate, "n_dropped_before": ready.n_dropped, "finch": levels}
-    return Scores(tables, {**found.numbers(), **more}, [*notes, how.memory.summary()])
+    return Scores(tables, {**result.numbers(), **more}, [*notes, how.memory.summary()])
 
 
 @dataclass(frozen=True)
@@ -188,8 +188,8 @@ def compare_clusterings(
     orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
     deals = [_scorer(numbers, {label: own[order] for label, own in first.items()}) for order in orders]
     chance = np.stack([deal(once)[0].mean(axis=0) for deal in deals], axis=1)
-    found = {score: constant(own, resample_count) for score, own in zip(METRICS, chance, strict=True)}
-    rows.append(ScoredRow("chance", True, len(deals), found))
+    result = {score: constant(own, resample_count) for score, own in zip(METRICS, chance, strict=True)}
+    rows.append(ScoredRow("chance", True, len(deals), result))
     n_missing = sum(int((values < 0).sum()) for values in numbers.values())
     dropped = int((~labelled).sum())
     return ClusterComparison(with_verdicts(rows), method, sizes, n_rows, dropped, n_missing, per_label)
@@ -237,14 +237,14 @@ def _scorer(
     return scores
 
 
-def clustering_table(found: ClusterComparison) -> ScoreTable:
+def clustering_table(result: ClusterComparison) -> ScoreTable:
     """One row for each feature and control, every score."""
-    caption = about_clustering(found.method, found.n_rows, found.labels)
-    if found.n_dropped:
-        caption += f"; {found.n_dropped:,} rows without label left out"
-    if found.n_missing:
-        caption += f"; {found.n_missing:,} single labels unknown"
-    return scored_table(caption, "features", found.rows, CLUSTER_COLUMNS)
+    caption = about_clustering(result.method, result.n_rows, result.labels)
+    if result.n_dropped:
+        caption += f"; {result.n_dropped:,} rows without label left out"
+    if result.n_missing:
+        caption += f"; {result.n_missing:,} single labels unknown"
+    return scored_table(caption, "features", result.rows, CLUSTER_COLUMNS)
 
 
 @dataclass(frozen=True)

@@ -165,9 +165,9 @@ def _look(
             inside = np.flatnonzero((rows >= left) & (rows < left + TILE))
             block[inside, rows[inside] - left] = np.inf
             at = block.argmin(axis=1)
-            found = block[np.arange(len(rows)), at]
-            better = found < best
-            best[better], where[better] = found[better], at[better] + left
+            result = block[np.arange(len(rows)), at]
+            better = result < best
+            best[better], where[better] = result[better], at[better] + left
         nearest[rows], distance[rows] = where, best
 
 
@@ -235,8 +235,8 @@ def clusterings(
         hierarchy = finch(features, memory)
         return {count: finch_clusters(features, count, hierarchy) for count in wanted}
     if method == "ward" and len(features) > neighbours.EXACT_ROWS:
-        found = memory.recall("ward-cells", inputs, lambda: ward_in_cells(features))
-        return {count: cut(n_clusters=count, **found) for count in wanted}
+        result = memory.recall("ward-cells", inputs, lambda: ward_in_cells(features))
+        return {count: cut(n_clusters=count, **result) for count in wanted}
     if method == "ward":
         tree = memory.recall_one("ward", inputs, lambda: ward_tree(features))
         return {count: cut(tree, count) for count in wanted}

@@ -200,17 +200,17 @@ class Renderings:
     def whiten(self, encoder: Derenderer, progress: Progress | None = None) -> Derenderer:
         """A copy of an encoder whose geometry and albedo are whitened by the renderings; its scenes stay."""
         names = [factor.name for factor in encoder.factors if factor.mirrored]
-        found = copy.deepcopy(encoder.without_features()).eval()  # mirror images are views here
-        describe = found.activations if self.settings.whitening.spatial else found.encode
+        result = copy.deepcopy(encoder.without_features()).eval()  # mirror images are views here
+        describe = result.activations if self.settings.whitening.spatial else result.encode
 
         def described(images: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-            output = describe(images.to(found.device))
+            output = describe(images.to(result.device))
             return {name: output[name] for name in names}
 
         size = encoder.settings.network.code_size
-        whitening = self._fitted(described, f"{model_fingerprint(found)} {size}", progress, size)
-        features = Features(whitening.to(found.device), encoder.fitting)
-        return found.with_features(features).train(encoder.training)
+        whitening = self._fitted(described, f"{model_fingerprint(result)} {size}", progress, size)
+        features = Features(whitening.to(result.device), encoder.fitting)
+        return result.with_features(features).train(encoder.training)
 
     def components(self, images: ImageSet, progress: Progress | None = None) -> FeatureTable:
         """Principal components of the lent images, whitened by their renderings: factor ``pca``."""
@@ -237,11 +237,11 @@ class Renderings:
         }  # fmt: skip
 
         def make() -> dict[str, np.ndarray]:
-            found = fit_whitening(
+            result = fit_whitening(
                 bare, torch.from_numpy(self.images), settings.whitening, settings.perturb,
                 describe=describe, size=size, progress=progress,
             )  # fmt: skip
-            return {name: value.cpu().numpy() for name, value in found.named_buffers()}
+            return {name: value.cpu().numpy() for name, value in result.named_buffers()}
 
         arrays = self.memory.recall("lent whitening", inputs, make)
         return Whitening.of({name: torch.from_numpy(values) for name, values in arrays.items()})

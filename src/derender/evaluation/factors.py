@@ -86,9 +86,9 @@ class FactorResult(ImageResult):
 
         light, camera = self.light_control.each_deg, self.camera_control.each_deg
         constant = (self.albedo_control_each, self.albedo_global_control_each, light, light, camera)
-        found = {"model": own(self), "constant answer": constant}
-        found |= {} if self.untrained is None else {"untrained model": own(self.untrained)}
-        return {row: dict(zip(self.columns, each, strict=True)) for row, each in found.items()}
+        result = {"model": own(self), "constant answer": constant}
+        result |= {} if self.untrained is None else {"untrained model": own(self.untrained)}
+        return {row: dict(zip(self.columns, each, strict=True)) for row, each in result.items()}
 
 
 def albedo_error(

@@ -88,11 +88,11 @@ def identify(
     )  # fmt: skip
     near = known & (angle <= cluster_within) if angle is not None else np.zeros(len(who), bool)
     if len(set(who[near])) > 1 and len(set(who[near])) < near.sum():
-        found = compare_clusterings(
+        result = compare_clusterings(
             {name: [run[near] for run in runs] for name, runs in ready.features.items()}, {label: who[near]},
             controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
         ).rows  # fmt: skip
-        ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in found}
+        ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in result}
         scored = with_verdicts([replace(row, scores={**row.scores, **ward[row.name]}) for row in scored])
         note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}

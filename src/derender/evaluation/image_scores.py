@@ -58,11 +58,11 @@ class ImageResult:
         """The scores in the units of the columns; with ``rows``, their intervals too."""
         count = len(next(iter(self.each()["model"].values())))
         more = {} if self.coverage is None else {self.coverage: lambda row: self.named()[row.name].coverage}
-        found = scored_table(
+        result = scored_table(
             self.caption.format(count), "prediction", rows or self.rows(1), self.columns,
             intervals=() if rows is None else tuple(self.columns), deviations=(), more=more, over="images",
         )  # fmt: skip
-        return replace(found, rows=[replace(row, note=self.notes.get(row.name, "")) for row in found.rows])
+        return replace(result, rows=[replace(row, note=self.notes.get(row.name, "")) for row in result.rows])
 
 
 def image_rows(
@@ -83,8 +83,8 @@ def image_rows(
     quiet = list(scores)[1:] if controls is None else controls
     rows = []
     for name, each in scores.items():
-        found = {score: _estimate(values, weights) for score, values in each.items()}
-        rows.append(ScoredRow(name, name in quiet, 1, found))
+        result = {score: _estimate(values, weights) for score, values in each.items()}
+        rows.append(ScoredRow(name, name in quiet, 1, result))
     return with_verdicts(rows, lower=[name for name, column in columns.items() if column.best == "low"])
 
 
@@ -120,18 +120,18 @@ def binned_rows(
 
 def image_verdicts(row: ScoredRow, columns: Mapping[str, Column]) -> list[str]:
     """In words, for every score: the row against the strongest control."""
-    found = []
+    results = []
     for score, column in columns.items():
         one = row.versus.get(score)
         if one is None or not isfinite(one.low):
             continue
         how = "better than" if one.above else "worse than" if one.high < 0 else "not distinguished from"
         ends = [f"{column.scale * value:+.{column.digits}f}" for value in (one.value, one.low, one.high)]
-        found.append(
+        results.append(
             f"{column.name}: {column.text(column.scale * row.scores[score].value)}, {how} the strongest "
             f"control ({one.rival}), by {ends[0]}, 95 % {ends[1]} to {ends[2]}"
         )
-    return found
+    return results
 
 
 def _estimate(values: np.ndarray, weights: np.ndarray) -> Estimate:

@@ -125,8 +125,8 @@ def nearest_answers(features: np.ndarray, targets: np.ndarray, tested: np.ndarra
     """Share of each value among the ten nearest training rows by cosine: (T, A), 0.5 if all are unknown."""
     mean = features.mean(axis=0)
     near, far = (unit_rows(np.asarray(rows, np.float64) - mean) for rows in (features, tested))
-    found = np.argsort(-(far @ near.T), axis=1, kind="stable")[:, :10]
-    return _shares(targets[found])
+    result = np.argsort(-(far @ near.T), axis=1, kind="stable")[:, :10]
+    return _shares(targets[result])
 
 
 def majority_answers(task: Task, rows: np.ndarray, n_tested: int) -> np.ndarray:
@@ -263,9 +263,9 @@ def logistic_weights(
         losses.append(np.where(learned[:, :, None], 0.0, loss).sum(axis=(0, 1)))
     chosen = np.asarray(penalties)[np.argmin(losses, axis=0)]
     whole = np.ones((len(rows), 1), bool)
-    found = {c: solve_logistic(rows, labels, whole, c, kind)[:, 0] for c in set(chosen.tolist())}
+    result = {c: solve_logistic(rows, labels, whole, c, kind)[:, 0] for c in set(chosen.tolist())}
     own = chosen.tolist() if kind == "labels" else chosen.tolist() * labels.shape[1]
-    picked = np.stack([found[c][:, label] for label, c in enumerate(own)], axis=1)
+    picked = np.stack([result[c][:, label] for label, c in enumerate(own)], axis=1)
     return back @ picked[:-1], picked[-1] - mean @ (back @ picked[:-1]), chosen
 
 

@@ -120,18 +120,18 @@ def linear(
     rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes, least=2)
     ready = prepare(rows, names, min_count=min_count, max_count=max_count)
-    found = compare_prepared(
+    result = compare_prepared(
         ready, counts, how.seeds(seeds), how, heads=heads, settings=HeadSettings(epochs=epochs),
         models={rows[0].name: [features]} if finetune and is_model(features) else {},
         test_fraction=test_fraction, groups=ready.table.label(groups) if groups else None,
     )  # fmt: skip
-    tables, notes = linear_tables(found), [*how.notes, *left_out, how.memory.summary()]
+    tables, notes = linear_tables(result), [*how.notes, *left_out, how.memory.summary()]
     if ready.n_dropped:
         notes.insert(
             0, f"{ready.n_dropped:,} rows beyond {min_count} to {max_count or 'all'} rows of a class left out"
         )
-        found = replace(found, n_dropped=found.n_dropped + ready.n_dropped)
-    return Scores(tables, {**found.numbers(), "labels": names}, notes)
+        result = replace(result, n_dropped=result.n_dropped + ready.n_dropped)
+    return Scores(tables, {**result.numbers(), "labels": names}, notes)
 
 
 @dataclass(frozen=True)
@@ -276,14 +276,14 @@ def _row(
     return replace(row, scores={**row.scores, "average_precision": precision})
 
 
-def linear_tables(found: LinearComparison) -> list[ScoreTable]:
+def linear_tables(result: LinearComparison) -> list[ScoreTable]:
     """Every head at every number of labels, each with its differences to the strongest control."""
-    tables, count = [], len(found.names)
-    asked = f"{count} classes" if found.kind == "classes" else f"mean of {count} yes/no labels"
-    asked = f"{found.n_test:,} rows tested, {asked}, {len(found.seeds)} seeds"
-    if found.n_dropped:
-        asked += f"; {found.n_dropped:,} rows without label left out"
-    for part in found.parts:
+    tables, count = [], len(result.names)
+    asked = f"{count} classes" if result.kind == "classes" else f"mean of {count} yes/no labels"
+    asked = f"{result.n_test:,} rows tested, {asked}, {len(result.seeds)} seeds"
+    if result.n_dropped:
+        asked += f"; {result.n_dropped:,} rows without label left out"
+    for part in result.parts:
         rows = f"{part.count:,} labelled rows"
         caption = f"{rows}, {PROBE_NAMES[part.head]}: {asked}"
         judged = f"{rows}, {part.head}: above the strongest control?"

@@ -63,8 +63,8 @@ class Memory:
 
     def recall_one(self, what: str, inputs: Mapping[str, Any], make: Callable[[], np.ndarray]) -> np.ndarray:
         """The same for a single array."""
-        (found,) = self.recall(what, inputs, lambda: {"value": make()}).values()
-        return found
+        (result,) = self.recall(what, inputs, lambda: {"value": make()}).values()
+        return result
 
     def recall_value(self, what: str, inputs: Mapping[str, Any], kind: type[T], make: Callable[[], T]) -> T:
         """The same for a dataclass ``kind`` of numbers, texts, arrays, tuples, mappings and such dataclasses.

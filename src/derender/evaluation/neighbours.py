@@ -104,8 +104,8 @@ def cells(points: Float32[np.ndarray, "n d"], rows_per_cell: int) -> list[Int64[
             continue
         wanted = -(-len(rows) // rows_per_cell)
         sampled = generator.choice(rows, min(len(rows), 32 * wanted), replace=False)
-        found = _nearest_centre(points, rows, _centres(points[np.sort(sampled)], wanted, generator))
-        parts = [rows[found == one] for one in np.unique(found)]
+        result = _nearest_centre(points, rows, _centres(points[np.sort(sampled)], wanted, generator))
+        parts = [rows[result == one] for one in np.unique(result)]
         if len(parts) == 1:  # copies of one row: no centre tells them apart
             parts = np.array_split(rows, wanted)
         for part in parts:
@@ -122,9 +122,9 @@ def of_each(work: Callable[[int], T], groups: Sequence[np.ndarray]) -> Iterator[
 def _centres(sample: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
     centres = sample[generator.choice(len(sample), wanted, replace=False)].copy()
     for _ in range(6):
-        found = _nearest_centre(sample, np.arange(len(sample)), centres)
-        order = np.argsort(found, kind="stable")
-        held, first = np.unique(found[order], return_index=True)
+        result = _nearest_centre(sample, np.arange(len(sample)), centres)
+        order = np.argsort(result, kind="stable")
+        held, first = np.unique(result[order], return_index=True)
         sums = np.add.reduceat(sample[order], first, axis=0)
         centres[held] = sums / np.diff([*first, len(sample)])[:, None]
     return centres

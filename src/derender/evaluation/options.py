@@ -84,17 +84,17 @@ class Options:
             how: dict[str, Any] = {
                 name: getattr(self, name) for name in ("dataset", "limit", "keep_duplicates")
             }
-            found = as_images(self.images, image_size, **how, progress=self.stage("reading"))
-            if found.images.shape[-1] != image_size:
+            result = as_images(self.images, image_size, **how, progress=self.stage("reading"))
+            if result.images.shape[-1] != image_size:
                 raise ValueError(
-                    f"the images have {found.images.shape[-1]} pixels a side and {image_size} are needed: "
+                    f"the images have {result.images.shape[-1]} pixels a side and {image_size} are needed: "
                     "give the address of the data set instead"
                 )
-            self.notes.append(found.describe())
-            self.notes.extend(f"skipped {row.file}: {row.reason}" for row in found.skipped[:NAMED])
-            if len(found.skipped) > NAMED:
-                self.notes.append(f"and {len(found.skipped) - NAMED:,} more skipped")
-            self._read[image_size] = found
+            self.notes.append(result.describe())
+            self.notes.extend(f"skipped {row.file}: {row.reason}" for row in result.skipped[:NAMED])
+            if len(result.skipped) > NAMED:
+                self.notes.append(f"and {len(result.skipped) - NAMED:,} more skipped")
+            self._read[image_size] = result
         read = self._read[image_size]
         return read if files is None else aligned(read, files)
 

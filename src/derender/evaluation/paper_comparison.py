@@ -79,16 +79,16 @@ def compare(
         for name, (model, *others) in models.items():
             if others:
                 raise ValueError(f"two models have the name {name!r}: give each its own")
-            found = segment(
+            result = segment(
                 as_model(model, device=how.device), images, masks=masks, dataset=how.dataset,
                 limit=how.limit, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
                 settings=SegmentSettings(epochs=epochs), resample_count=how.resamples, memory=how.memory,
                 progress=how.progress,
             )  # fmt: skip
-            shown = (found.tables[-1], *found.tables[:-1])
+            shown = (result.tables[-1], *result.tables[:-1])
             tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]
-            more = {"differs": found.result.differs, "paper": spec.parts[0].paper}
-            values[name] = {**found.result.numbers(), **more}
+            more = {"differs": result.result.differs, "paper": spec.parts[0].paper}
+            values[name] = {**result.result.numbers(), **more}
         return Scores(tables, {**numbers, "parts": values}, [how.memory.summary()])
     if masks is not None:
         raise ValueError(f"masks go with the table of segmentation, not with {table}")
@@ -122,10 +122,10 @@ def compare(
         if spec.kind == "cluster":
             asked = (ready.features, ready.labels)
             again = {"controls": ready.controls, "resample_count": how.resamples, "seed": how.seed}
-            found = compare_clusterings(*asked, method=method, memory=how.memory, **again)
-            more |= {"n_dropped_before": ready.n_dropped, "differs": part.differs(layout, found.n_rows)}
+            result = compare_clusterings(*asked, method=method, memory=how.memory, **again)
+            more |= {"n_dropped_before": ready.n_dropped, "differs": part.differs(layout, result.n_rows)}
             shown = {name: CLUSTER_COLUMNS[name] for name in ("accuracy", "f1")}
-            scored = {row.name: row for row in found.rows}
+            scored = {row.name: row for row in result.rows}
             if method == "ward":  # the paper's appendix has FINCH beside it
                 finch = compare_clusterings(*asked, method="finch", memory=how.memory, **again)
                 more["finch"] = finch.numbers()
@@ -139,29 +139,31 @@ def compare(
             caption = f"{part.name}, {beside} ({METHODS[method]})"
             tables += [
                 beside_the_paper(caption, shown, ours, quiet, part.paper, more["differs"]),
-                clustering_table(found),
-                verdict_table(found.rows, CLUSTER_COLUMNS, f"{part.name}: above the strongest control?"),
+                clustering_table(result),
+                verdict_table(result.rows, CLUSTER_COLUMNS, f"{part.name}: above the strongest control?"),
             ]
             if ready.n_dropped:
                 notes.append(
                     f"{part.name}: {ready.n_dropped:,} rows without a label or beyond its sizes left out"
                 )
         else:
-            found = compare_prepared(
+            result = compare_prepared(
                 ready, counts, how.seeds(seeds), how, models=models if finetune else None,
                 supervised=supervised,
             )  # fmt: skip
             more |= {"differs": part.differs(layout, len(ready.table))}
             caption = f"{part.name}: accuracy of the paper's head, {beside}"
-            tables += [heads_table(caption, found, part.paper, more["differs"]), *linear_tables(found)]
-        values[part.name] = {**found.numbers(), **more}
+            tables += [heads_table(caption, result, part.paper, more["differs"]), *linear_tables(result)]
+        values[part.name] = {**result.numbers(), **more}
     return Scores(tables, {**numbers, "parts": values}, [*notes, how.memory.summary()])
 
 
-def heads_table(caption: str, found: LinearComparison, paper: Sequence[PaperRow], differs: str) -> ScoreTable:
+def heads_table(
+    caption: str, result: LinearComparison, paper: Sequence[PaperRow], differs: str
+) -> ScoreTable:
     """Accuracies of the paper's head by number of labels, frozen and fine-tuned, over the paper's own."""
     columns, ours, controls = {}, {}, []
-    for part in found.parts:
+    for part in result.parts:
         if part.head in ("linear", FINETUNED):
             key, how = f"{part.head} {part.count}", "frozen" if part.head == "linear" else part.head
             columns[key] = Column(f"{part.count:,} {how}", "high")

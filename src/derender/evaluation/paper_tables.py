@@ -35,13 +35,13 @@ class PaperRow:
 def _lines(part: str) -> tuple[PaperRow, ...]:
     """The paper's lines of a part, in its order."""
     text = (files("derender.evaluation") / "paper_tables.csv").read_text(encoding="utf-8")
-    found = []
+    results = []
     for line in csv.DictReader(text.splitlines()):
         if line.pop("part") == part:
             method, dataset = line.pop("method"), line.pop("dataset")
             scores = {name: float(value) for name, value in line.items() if value}
-            found.append(PaperRow(method, dataset, scores))
-    return tuple(found)
+            results.append(PaperRow(method, dataset, scores))
+    return tuple(results)
 
 
 @dataclass(frozen=True)

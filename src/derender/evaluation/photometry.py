@@ -143,12 +143,12 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
 
     picture = seen["model"]["image"] @ LUMA
     shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
-    found = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
+    result = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
     groups = []
     for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True)):
-        scores = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in found.items()}
+        scores = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in result.items()}
         groups.append(ScoredRow(f"{name} ({int(number):,})", False, 1, scores))
-    columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in found}
+    columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in result}
     columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
     taken = {name: estimate(share(one, once), share(one, weights)) for name, one in answers.items()}

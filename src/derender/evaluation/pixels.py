@@ -170,7 +170,7 @@ def masked_ssim(
 
     if min(target.shape[-2:]) < WINDOW:
         return torch.full((len(target),), torch.nan, dtype=torch.float64)
-    found = []
+    results = []
     parts = (values.split(32) for values in (prediction, target, mask > 0))  # such convolutions take memory
     for shown, true, covered in zip(*parts, strict=True):
         hole = torch.nn.functional.pad((~covered).float(), (WINDOW // 2,) * 4, value=1.0)
@@ -180,5 +180,5 @@ def masked_ssim(
             one, other, data_range=1.0, sigma=1.5, reduction="none", return_full_image=True
         )
         total = torch.where(inside, torch.as_tensor(similarity).mean(dim=1), 0.0).sum(dim=(1, 2))
-        found.append(total.double() / inside.sum(dim=(1, 2)))
-    return torch.cat(found)
+        results.append(total.double() / inside.sum(dim=(1, 2)))
+    return torch.cat(results)

@@ -72,11 +72,11 @@ def geometry(
         protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **how)
     protocols["reconstruction"] = ReconstructionResult, again
     inputs = {**known, "seed": seed, "fitted": fit_steps or 0}
-    found = _scored(model, protocols, inputs, resample_count, memory)
-    if isinstance(factors := found.values.get("factors"), FactorResult):
+    result = _scored(model, protocols, inputs, resample_count, memory)
+    if isinstance(factors := result.values.get("factors"), FactorResult):
         parts = {"factors": replace(factors, untrained=None), "factors_untrained": factors.untrained}
-        found = replace(found, values={**found.values, **parts})
-    return found
+        result = replace(result, values={**result.values, **parts})
+    return result
 
 
 def reconstruction(
@@ -113,8 +113,10 @@ def reconstruction(
         )  # fmt: skip
 
     inputs = {"images": images.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0}
-    found = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, resample_count, memory)
-    return replace(found, values={**found.values, "intervals": found.values["intervals"]["reconstruction"]})
+    result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, resample_count, memory)
+    return replace(
+        result, values={**result.values, "intervals": result.values["intervals"]["reconstruction"]}
+    )
 
 
 def _scored(
@@ -127,13 +129,13 @@ def _scored(
     """Results of protocols, from the cache if the same model and inputs gave them before."""
     settings, kept = model.settings.model_dump(mode="json"), memory or Memory()
     inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
-    found = {name: kept.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
-    rows = {name: one.rows(resample_count) for name, one in found.items()}
-    notes = [note for name, one in found.items() for note in image_verdicts(rows[name][0], one.columns)]
+    result = {name: kept.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
+    rows = {name: one.rows(resample_count) for name, one in result.items()}
+    notes = [note for name, one in result.items() for note in image_verdicts(rows[name][0], one.columns)]
     intervals = {name: numbers_of(scored) for name, scored in rows.items()}
-    values = {"pictures": len(inputs["images"]), **found, "intervals": intervals}
-    tables = [one.table(rows[name]) for name, one in found.items()]
-    return Scores(tables, values, notes, result=next(iter(found.values())))
+    values = {"pictures": len(inputs["images"]), **result, "intervals": intervals}
+    tables = [one.table(rows[name]) for name, one in result.items()]
+    return Scores(tables, values, notes, result=next(iter(result.values())))
 
 
 def optimised(model: Derenderer, steps: int | None) -> Derenderer:

@@ -267,13 +267,13 @@ VERDICT_COLUMNS = (
 
 def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], caption: str) -> ScoreTable:
     """Which row is above the strongest control, in each score named by a column, and by how much."""
-    found = []
+    results = []
     for row in rows:
         for name, one in row.versus.items():
             if name in columns and isfinite(row.scores[name].low):
                 cells = (one.value, one.low, one.high, one.rival, "yes" if one.above else "no")
-                found.append(Row(f"{row.name}: {columns[name].name}", cells))
-    return ScoreTable(caption, "features: score", VERDICT_COLUMNS, found)
+                results.append(Row(f"{row.name}: {columns[name].name}", cells))
+    return ScoreTable(caption, "features: score", VERDICT_COLUMNS, results)
 
 
 def verdict(row: ScoredRow, score: str) -> str:
@@ -281,9 +281,9 @@ def verdict(row: ScoredRow, score: str) -> str:
     own, one = row.scores[score], row.versus.get(score)
     if one is None:
         return f"{row.name}: {own.value:.3f} ({score})"
-    found = "above" if one.above else "below" if one.high < 0 else "not distinguished from"
+    result = "above" if one.above else "below" if one.high < 0 else "not distinguished from"
     return (
-        f"{row.name}: {score} {own.value:.3f}, {found} the strongest control ({one.rival}): "
+        f"{row.name}: {score} {own.value:.3f}, {result} the strongest control ({one.rival}): "
         f"{one.value:+.3f}, 95 % {one.low:+.3f} to {one.high:+.3f}"
     )
 

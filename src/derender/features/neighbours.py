@@ -146,8 +146,8 @@ def nearest(
     away = _distances(query, rows, metric)
     away[hidden] = np.inf
     places = np.flatnonzero(away <= np.partition(away, count - 1)[count - 1])
-    found = places[np.argsort(away[places], kind="stable")][:count]
-    return found, away[found]
+    result = places[np.argsort(away[places], kind="stable")][:count]
+    return result, away[result]
 
 
 def same_image(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np.ndarray, " m"]:

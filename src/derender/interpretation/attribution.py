@@ -77,11 +77,11 @@ def integrated_gradients(
     if not len(z):
         return np.zeros(features.shape), np.zeros(0)
     start = z.new_zeros(1, z.shape[1]) if baseline is None else z.new_tensor(baseline[None])
-    found, error = method.attribute(
+    result, error = method.attribute(
         z, start, n_steps=STEPS[output], return_convergence_delta=True,
         internal_batch_size=max(len(z), NUMBERS_AT_ONCE // z.shape[1]),
     )  # fmt: skip
-    return found.detach().numpy(), error.detach().numpy()
+    return result.detach().numpy(), error.detach().numpy()
 
 
 def factor_shares(attributions: np.ndarray, probe: Probe) -> np.ndarray:
@@ -157,11 +157,11 @@ def pixel_attribution(
 
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():
-        found = captum_attr().IntegratedGradients(answer).attribute(
+        result = captum_attr().IntegratedGradients(answer).attribute(
             images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS,
             internal_batch_size=max(len(images), 64),
         )  # fmt: skip
-    return found.detach().abs().sum(dim=1).to(images)
+    return result.detach().abs().sum(dim=1).to(images)
 
 
 def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size size"]:
@@ -206,15 +206,15 @@ def sanity_check(
     ``probe`` is explained, ``shuffled`` learned shuffled labels. Two ``images`` or more are in 0..1,
     ``targets`` the label or class explained for each.
     """
-    twins, found = [untrained_twin(model, seed) for seed in seeds], []
+    twins, result = [untrained_twin(model, seed) for seed in seeds], []
     asked = [(model, probe), (model, shuffled), *((twin, probe) for twin in twins)]
     for method in methods:
         for factor in probe.factors:
             maps = (saliency(method, net, images, factor, one, targets) for net, one in asked)
             own, learned, *fresh = maps
             for changed, others in zip(CHANGES, (fresh, [learned], [own.roll(1, dims=0)]), strict=True):
-                found.append(similarity(method, factor, changed, own, others, images.shape[-1]))
-    return found
+                result.append(similarity(method, factor, changed, own, others, images.shape[-1]))
+    return result
 
 
 def similarity(

@@ -205,7 +205,7 @@ def explain_labels(
             if progress is not None:
                 progress(sum(map(len, runs.values())), total)
     first, shuffled = (runs[name][0][0] for name in ("model", "shuffled labels"))
-    shares = tuple(_row(name, [found for _, *found in own]) for name, own in runs.items() if own)
+    shares = tuple(_row(name, [result for _, *result in own]) for name, own in runs.items() if own)
     return Explanation(
         task.kind, task.names, first.factors, shares, first, shuffled, count, len(split.test), head, output,
         baseline,
@@ -220,10 +220,10 @@ def _shares(
     error, scale = np.zeros((2, 1))
     for answer in range(targets.shape[1]):
         asked = targets[:, answer] >= (0 if probe.kind == "labels" else 1)
-        found, delta = integrated_gradients(probe, z[asked], answer, baseline=start, output=output)
-        shares[asked, answer] = factor_shares(found, probe)
+        result, delta = integrated_gradients(probe, z[asked], answer, baseline=start, output=output)
+        shares[asked, answer] = factor_shares(result, probe)
         error = np.append(error, np.abs(delta))
-        scale = np.append(scale, np.abs(found.sum(axis=1) - delta))
+        scale = np.append(scale, np.abs(result.sum(axis=1) - delta))
     return shares, np.array([error.max(), scale.max()])
 
 
@@ -240,15 +240,15 @@ def scores(probe: Probe, z: np.ndarray, targets: np.ndarray, seed: int) -> tuple
 
 def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
     """NaN where the test rows have one value only."""
-    found = np.full(targets.shape[1], np.nan)
+    result = np.full(targets.shape[1], np.nan)
     if kind == "classes":  # a class's lead over the best of the others: what decides the answer
         second, best = np.sort(logits, axis=1)[:, -2:, None].transpose(1, 0, 2)
         logits = logits - np.where(logits == best, second, best)
     for answer, (truth, value) in enumerate(zip(targets.T, logits.T, strict=True)):
         rows = truth >= 0
         if len(np.unique(truth[rows])) == 2:
-            found[answer] = roc_auc_score(truth[rows], value[rows])
-    return found
+            result[answer] = roc_auc_score(truth[rows], value[rows])
+    return result
 
 
 def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> ShareRow:

@@ -154,10 +154,10 @@ class Probe:
     def columns(self, features: Mapping[str, np.ndarray]) -> np.ndarray:
         """The features of its factors side by side, (N, D)."""
         for name, size in self.sizes.items():
-            found = features[name].shape[1] if name in features else 0
-            if found != size:
+            result = features[name].shape[1] if name in features else 0
+            if result != size:
                 raise ValueError(
-                    f"the probe needs {size} numbers of factor {name!r}, the features have {found}: use the "
+                    f"the probe needs {size} numbers of factor {name!r}, the features have {result}: use the "
                     "model that it was fitted on"
                 )
         return np.concatenate([features[name] for name in self.sizes], axis=1)
@@ -235,8 +235,8 @@ def fit_probe(
         weight = weight.T
     else:
         how = {"kind": task.kind, "seeds": [seed], "settings": settings}
-        _, found, start = fitted_heads(x, y, np.arange(len(x))[None], **how)
-        weight, bias = found[0].T.double().numpy(), start[0, 0].double().numpy()
+        _, result, start = fitted_heads(x, y, np.arange(len(x))[None], **how)
+        weight, bias = result[0].T.double().numpy(), start[0, 0].double().numpy()
     if task.kind == "classes":
         weight, bias = weight - weight.mean(axis=0), bias - bias.mean()
     return Probe(task.kind, task.names, sizes, weight.astype(np.float32), bias.astype(np.float32), head)

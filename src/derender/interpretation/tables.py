@@ -78,15 +78,15 @@ def cluster_shares(
         apart = np.stack([(values**2).sum(axis=1) for values in means], axis=1)  # |mean of the cluster|^2
         return apart * (sizes * count / (count - sizes))[:, None]
 
-    generator, found = np.random.default_rng(seed), between(member)
+    generator, result = np.random.default_rng(seed), between(member)
     shuffled = [between(generator.permutation(member)) for _ in range(permutations)]
-    distance = found / (sizes * (count - sizes) / count)[:, None]
+    distance = result / (sizes * (count - sizes) / count)[:, None]
     return ClusterShares(
         tuple(map(str, names)),
         tuple(features),
         sizes,
         _over(distance, distance.sum(axis=1, keepdims=True)),
-        _over(found, total),
+        _over(result, total),
         _over(np.mean(shuffled, axis=0), total),
     )
 
@@ -188,13 +188,13 @@ class Explanation:
 AUC = Column("AUC", note="area under the ROC curve on held-out images, chance 0.5, best 1")
 
 
-def share_table(found: Explanation) -> ScoreTable:
+def share_table(result: Explanation) -> ScoreTable:
     """One row for each label or class, their mean first; the means of the controls last."""
     columns: list[Column] = []
-    for factor in found.factors:
+    for factor in result.factors:
         column = Column(factor, note="share of the sum of |integrated gradients|, 0 to 1")
         columns += [column, interval_column(column, "images")]
-    model = found.rows[0]
+    model = result.rows[0]
 
     def cells(row: ShareRow, answer: int | None) -> list[Cell]:
         shown: list[Cell] = []
@@ -203,40 +203,40 @@ def share_table(found: Explanation) -> ScoreTable:
             shown += [share, None if answer is None else Interval(*ends[answer][place])]
         return [*shown, *_means(row.auc[..., None], answer)]
 
-    what = "yes/no labels" if found.kind == "labels" else "classes, each on its own images"
+    what = "yes/no labels" if result.kind == "labels" else "classes, each on its own images"
     seeds = len(model.shares)
     caption = (
-        f"Share of each factor in the answer: {found.head} probe of {found.n_train:,} images, "
-        f"{found.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(found.names)} {what}; "
-        f"{found.output} from a {found.baseline} baseline, completeness error {model.error:.1e}"
+        f"Share of each factor in the answer: {result.head} probe of {result.n_train:,} images, "
+        f"{result.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(result.names)} {what}; "
+        f"{result.output} from a {result.baseline} baseline, completeness error {model.error:.1e}"
     )
-    return _answers(found, caption, [*columns, AUC], cells)
+    return _answers(result, caption, [*columns, AUC], cells)
 
 
-def drop_table(found: Explanation) -> ScoreTable:
+def drop_table(result: Explanation) -> ScoreTable:
     """AUC lost when one factor's features are exchanged between the held-out images."""
-    columns = [Column(factor, note="AUC lost without this factor") for factor in found.factors]
+    columns = [Column(factor, note="AUC lost without this factor") for factor in result.factors]
     caption = "AUC lost when one factor's features are exchanged between images: a check without gradients"
-    return _answers(found, caption, columns, lambda row, answer: _means(row.drop, answer))
+    return _answers(result, caption, columns, lambda row, answer: _means(row.drop, answer))
 
 
-def _answers(found: Explanation, caption: str, columns: Sequence[Column], cells: Any) -> ScoreTable:
+def _answers(result: Explanation, caption: str, columns: Sequence[Column], cells: Any) -> ScoreTable:
     """A row for each answer of the model, their mean (None) first, those of controls last."""
-    model, *controls = found.rows
-    rows = [Row(f"mean of {len(found.names)}", cells(model, None))] if len(found.names) > 1 else []
-    rows += [Row(name, cells(model, answer)) for answer, name in enumerate(found.names)]
+    model, *controls = result.rows
+    rows = [Row(f"mean of {len(result.names)}", cells(model, None))] if len(result.names) > 1 else []
+    rows += [Row(name, cells(model, answer)) for answer, name in enumerate(result.names)]
     rows += [Row(row.name, cells(row, None), True) for row in controls]
-    return ScoreTable(caption, "label" if found.kind == "labels" else "class", columns, rows)
+    return ScoreTable(caption, "label" if result.kind == "labels" else "class", columns, rows)
 
 
-def share_verdicts(found: Explanation) -> list[str]:
+def share_verdicts(result: Explanation) -> list[str]:
     """In words, each factor's mean share beside that of shuffled labels, largest first."""
-    shares = {row.name: np.nanmean(row.shares, axis=(0, 1)) for row in found.rows}
+    shares = {row.name: np.nanmean(row.shares, axis=(0, 1)) for row in result.rows}
     own, chance = shares["model"], shares["shuffled labels"]
-    drop = np.nanmean(found.rows[0].drop, axis=(0, 1))
+    drop = np.nanmean(result.rows[0].drop, axis=(0, 1))
     return [
-        f"{found.factors[place]}: {100 * own[place]:.0f} % of |IG| ({100 * chance[place]:.0f} % where labels "
-        f"are shuffled); exchanged between images it costs {drop[place]:.3f} of the AUC"
+        f"{result.factors[place]}: {100 * own[place]:.0f} % of |IG| ({100 * chance[place]:.0f} % where "
+        f"labels are shuffled); exchanged between images it costs {drop[place]:.3f} of the AUC"
         for place in np.argsort(-own)
     ]
 
@@ -252,11 +252,11 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
         Column("empty", None, 2, "share of comparisons left out because a map was empty"),
         Column("changes", None, note="whether new weights change the map"),
     )
-    found: dict[str, dict[str, Similarity]] = {}
+    result: dict[str, dict[str, Similarity]] = {}
     for row in rows:
-        found.setdefault(f"{row.method}, {row.factor}", {})[row.changed] = row
+        result.setdefault(f"{row.method}, {row.factor}", {})[row.changed] = row
     lines = []
-    for name, by_change in found.items():
+    for name, by_change in result.items():
         fresh, labels, other = (by_change[changed] for changed in CHANGES)
         word = "-" if fresh.empty == 1 else "yes" if fresh.spearman < UNCHANGED else "no"
         cells = (fresh.spearman, fresh.ssim, labels.spearman, other.spearman, fresh.empty, word)
@@ -270,15 +270,15 @@ def unchanged(rows: Sequence[Similarity], changed: str) -> list[str]:
     return [f"{row.method}, {row.factor}" for row in stuck]
 
 
-def cluster_share_table(found: ClusterShares) -> ScoreTable:
+def cluster_share_table(result: ClusterShares) -> ScoreTable:
     """Parts of the distance of each cluster from the rest, and between-variance beside chance."""
     share = "share of the squared distance to the mean of all other images, 0 to 1"
     ratio = Column(
         "ratio", note="share of this factor's variance between cluster and rest; in brackets chance"
     )
-    columns = [column for factor in found.factors for column in (Column(factor, note=share), ratio)]
+    columns = [column for factor in result.factors for column in (Column(factor, note=share), ratio)]
     rows = []
-    columns_of = (found.names, found.sizes, found.share, found.ratio, found.chance)
+    columns_of = (result.names, result.sizes, result.share, result.ratio, result.chance)
     for name, size, *parts in zip(*columns_of, strict=True):
         cells: list[Cell] = [int(size)]
         for own, between, chance in zip(*parts, strict=True):
@@ -288,7 +288,7 @@ def cluster_share_table(found: ClusterShares) -> ScoreTable:
     return ScoreTable(caption, "cluster", [Column("images"), *columns], rows)
 
 
-def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
+def pair_table(result: PairParts, names: tuple[str, str]) -> ScoreTable:
     """Parts of the distance and cosine of two images, by factor and in all."""
     columns = (
         Column("of the distance", note="part of the squared distance, 0 to 1"),
@@ -296,10 +296,12 @@ def pair_table(found: PairParts, names: tuple[str, str]) -> ScoreTable:
         Column("own cosine", note="cosine of this factor alone, -1 to 1"),
         Column("alike", note="share of random pairs that lie farther apart in this factor; 1 is most alike"),
     )
-    parts = zip(found.distance_share, found.cosine, found.own_cosine, found.quantile, strict=True)
-    rows = [Row(factor, tuple(map(float, cells))) for factor, cells in zip(found.factors, parts, strict=True)]
-    whole = Row("all", (float(found.distance_share.sum()), float(found.cosine.sum()), None, None))
-    caption = f"{names[0]} and {names[1]}: most alike in {found.most_alike}, compared with other pairs"
+    parts = zip(result.distance_share, result.cosine, result.own_cosine, result.quantile, strict=True)
+    rows = [
+        Row(factor, tuple(map(float, cells))) for factor, cells in zip(result.factors, parts, strict=True)
+    ]
+    whole = Row("all", (float(result.distance_share.sum()), float(result.cosine.sum()), None, None))
+    caption = f"{names[0]} and {names[1]}: most alike in {result.most_alike}, compared with other pairs"
     return ScoreTable(caption, "factor", columns, (*rows, whole))
 
 

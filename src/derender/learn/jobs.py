@@ -264,7 +264,7 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
     images = _scored_images(at, job, settings.network.image_size)
     images = aligned(images, rows[0].tables[0].files) if rows else images
     rows += control_rows(images, settings, how)
-    table, found = rows[0].tables[0], []
+    table, results = rows[0].tables[0], []
     labels, rules = scored.label, scored.model_dump(include={"mean_by", "min_count", "max_count"})
     if labels == (ATTRIBUTES,):
         labels, _ = chosen_labels(table, None, True)
@@ -287,10 +287,10 @@ def score(at: Comparison, job: Job, progress: Callable[..., None]) -> Facts:
             else:
                 result = compare_prepared(ready, plan.counts, how.seeds(plan.draws), how)
             numbers = {key: value for key, value in result.numbers().items() if key != "per_label"}
-            found.append(plain({"name": name, "protocol": protocol, **numbers}))
+            results.append(plain({"name": name, "protocol": protocol, **numbers}))
     widths = {row.name: int(row.tables[0].concatenate(row.factors).shape[1]) for row in rows}
     untrained = parameter_count(Derenderer.seeded(settings, 0))
-    return {"questions": found, "numbers": widths, "untrained": untrained}
+    return {"questions": results, "numbers": widths, "untrained": untrained}
 
 
 def _scored_images(at: Comparison, job: Job, image_size: int, run: str | None = None) -> ImageSet:

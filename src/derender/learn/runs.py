@@ -109,8 +109,8 @@ def train(
     if this_rank_writes() and not resume:
         refuse_taken(out)
     with fabric.rank_zero_first(local=True):
-        told = Progress.of("reading", report)
-        images = as_images(images, image_size_of(config), dataset=dataset, limit=limit, progress=told)
+        reading = Progress.of("reading", report)
+        images = as_images(images, image_size_of(config), dataset=dataset, limit=limit, progress=reading)
     if on_images is not None:
         on_images(images)
     ours = isinstance(config, TrainConfig)
@@ -219,8 +219,8 @@ def finetune(
     if not resume:
         refuse_taken(out)
     start = None if config.start is None else as_model(config.start, device="cpu")
-    size, told = config.model.network.image_size, Progress.of("reading", report)
-    images = as_images(images, size, dataset=dataset, limit=limit, progress=told)
+    size, reading = config.model.network.image_size, Progress.of("reading", report)
+    images = as_images(images, size, dataset=dataset, limit=limit, progress=reading)
     if on_images is not None:
         on_images(images)
     if choices.get("attributes"):

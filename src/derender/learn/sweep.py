@@ -90,14 +90,19 @@ def write_outcome(at: Comparison, notes: Notes) -> Scores:
             lead=lead, facts=facts, failed=absent, picture=svg,
         )  # fmt: skip
         text, listed = Scores(tables, {}), "".join(f"\n- {sentence}" for sentence in absent)
-        told = {"protocol": protocol, "questions": questions, **reasons, "plan": plan.model_dump(mode="json")}
+        record = {
+            "protocol": protocol,
+            "questions": questions,
+            **reasons,
+            "plan": plan.model_dump(mode="json"),
+        }
         contents = {
             ".md": text.to_markdown() + (f"\nFailed or missing:\n{listed}\n" if absent else ""),
             ".tex": text.to_latex(),
             ".html": page.html(),
             ".svg": _standalone(svg),
             ".png": png,
-            ".json": json.dumps(plain(told), indent=1, ensure_ascii=False) + "\n",
+            ".json": json.dumps(plain(record), indent=1, ensure_ascii=False) + "\n",
         }
         for suffix, content in contents.items():
             content = content if isinstance(content, bytes) else content.encode(errors="replace")

@@ -156,11 +156,11 @@ class UNetEncoder(nn.Module):
 
     def skips(self, images: Images) -> list[Tensor]:
         """Features after each level, from full resolution down to 4x4, for a segmentation decoder."""
-        features, found = images * 2 - 1, []
+        features, result = images * 2 - 1, []
         for level, block in enumerate(self.levels):
             features = block(features if level == 0 else self.pool(features))
-            found.append(features)
-        return found
+            result.append(features)
+        return result
 
     def spatial(self, images: Images) -> Spatial:
         return self.skips(images)[-1]

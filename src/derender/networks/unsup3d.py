@@ -103,9 +103,9 @@ def _tensors(content: Mapping[Any, Any], net: str, file: Path) -> dict[str, Tens
     entry = content.get(net)
     if not isinstance(entry, Mapping):
         entry = {name: value for name, value in content.items() if str(name).startswith(f"{net}.")}
-    found = {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
-    require_plain(found, file)
-    return found
+    result = {str(name): value for name, value in entry.items() if isinstance(value, Tensor)}
+    require_plain(result, file)
+    return result
 
 
 def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSettings:
@@ -134,7 +134,7 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
 
 def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Path) -> dict[str, Tensor]:
     """The n-th tensor of the file under the name of the network's n-th."""
-    found: dict[str, Tensor] = {}
+    result: dict[str, Tensor] = {}
     expected = module.state_dict()
     for (name, value), (ours, like) in zip(theirs.items(), expected.items(), strict=False):
         if value.shape not in (like.shape, (*like.shape, 1, 1)):
@@ -144,9 +144,9 @@ def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Pa
             )
         if not bool(value.isfinite().all()):
             raise ValueError(f"{file}: {net} has {name} with NaN or infinite values: its training went wrong")
-        found[f"nets.{NETS[net]}.{ours}"] = value.detach().reshape(like.shape).float()
+        result[f"nets.{NETS[net]}.{ours}"] = value.detach().reshape(like.shape).float()
     if len(theirs) != len(expected):
         raise ValueError(
             f"{file}: {net} has {len(theirs)} tensors, expected {len(expected)}: this is another architecture"
         )
-    return found
+    return result

@@ -136,13 +136,13 @@ def load_vgg16(path: Path | str | None = None) -> Vgg16Features:
     path = Path(path).expanduser()
     if not path.is_file():
         raise ValueError(f"no VGG16 weights at {path}: {WHERE_TO_GET_IT}")
-    found = _read_weights(path)
+    result = _read_weights(path)
     net = Vgg16Features()
     expected = net.features.state_dict(prefix="features.")
     try:
-        if not isinstance(found, dict):
+        if not isinstance(result, dict):
             raise ValueError("it holds no named weights")
-        named = {name: value for name, value in found.items() if name in expected}
+        named = {name: value for name, value in result.items() if name in expected}
         check_fit(named, expected)
     except ValueError as problem:
         raise ValueError(f"{path} is not torchvision's VGG16 ({problem}): {WHERE_TO_GET_IT}") from problem

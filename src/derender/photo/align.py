@@ -126,10 +126,10 @@ def align(
         try:
             for number, sample in enumerate(stream.samples(), 1):
                 if sample.file not in finished:
-                    found = list(cutter.rows(sample.file, sample.read))
+                    results = list(cutter.rows(sample.file, sample.read))
                     with partial.open("a", newline="", encoding="utf-8") as file:
-                        csv.DictWriter(file, COLUMNS).writerows(found)
-                    rows += [{name: str(row.get(name, "")) for name in COLUMNS} for row in found]
+                        csv.DictWriter(file, COLUMNS).writerows(results)
+                    rows += [{name: str(row.get(name, "")) for name in COLUMNS} for row in results]
                 if progress is not None:
                     progress(number, estimated_total(number, sample.share, stream.limit))
                 if number == stream.limit:

@@ -197,10 +197,10 @@ class PhotoDetail:
         own = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift).permute(0, 3, 1, 2)
         places = (own[part] + unit * shift).permute(0, 2, 3, 1)
         photo = self.photo.expand(len(shift), -1, -1, -1)
-        found = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
-        kept, beyond = found, 0.0
+        result = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
+        kept, beyond = result, 0.0
         if veil.shape[1]:
-            clear = _cleared(found, veil)
+            clear = _cleared(result, veil)
             kept = clear.clamp(0, 1)
             beyond = _veiled(clear, veil) - _veiled(kept, veil)
         surface = torch.lerp(drawn.log(), (kept * ratio).clamp(DARKEST, 1).log(), trust).exp()
@@ -225,8 +225,8 @@ class PhotoDetail:
             image = interpolate(image, (side, side), mode="bilinear", antialias=True)
         edge = spread * (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
-        found = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
-        return found.clamp(0, 1)
+        result = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
+        return result.clamp(0, 1)
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
@@ -266,9 +266,9 @@ class PhotoDetail:
             cv2.setRNGSeed(0)
             back, front = np.zeros((2, 1, 65))  # of GrabCut's own
             cv2.grabCut(pixels, labels, (0, 0, 1, 1), back, front, 3, cv2.GC_INIT_WITH_MASK)
-        found = torch.from_numpy(labels & 1).to(photo)[None, None]
-        found = _ramp(avg_pool2d(found, 5, stride=1, padding=2, count_include_pad=False), 0.3, 0.8)
-        return _look_up(interpolate(found, (self.wide,) * 2, mode="bilinear"), self._place)
+        result = torch.from_numpy(labels & 1).to(photo)[None, None]
+        result = _ramp(avg_pool2d(result, 5, stride=1, padding=2, count_include_pad=False), 0.3, 0.8)
+        return _look_up(interpolate(result, (self.wide,) * 2, mode="bilinear"), self._place)
 
     def _pixels(self) -> Float[Tensor, "1 2 g g"]:
         return _square(torch.arange(self.wide).float()).permute(0, 3, 1, 2).to(self.photo)

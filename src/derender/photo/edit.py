@@ -236,8 +236,8 @@ def found_frame(
         return middle, "none"
     faces = find_faces(pixels)
     if faces:
-        found = "face" if abs(faces[0].yaw_deg) <= PROFILE_DEG else "profile"
-        return frame_of(faces[0], template or UTKFACE).snapped(), found
+        result = "face" if abs(faces[0].yaw_deg) <= PROFILE_DEG else "profile"
+        return frame_of(faces[0], template or UTKFACE).snapped(), result
     if frame is None:
         return middle, "no face"
     raise ValueError("no face is found in this image: choose frame auto or none")

@@ -95,8 +95,8 @@ def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
     candidates: list[Face] = []
     for quarter in range(4):
         turned = np.ascontiguousarray(np.rot90(small, -quarter))
-        found = [_turned(face, quarter, small.shape[:2]) for face in _both_ways(turned, twice=False)]
-        checked = [_checked(photo, _scaled(face, scale)) for face in found]
+        results = [_turned(face, quarter, small.shape[:2]) for face in _both_ways(turned, twice=False)]
+        checked = [_checked(photo, _scaled(face, scale)) for face in results]
         candidates += checked
         if any(not face.rejected for face in checked):
             break
@@ -105,12 +105,12 @@ def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
 
 def _both_ways(photo: UInt8[np.ndarray, "h w 3"], twice: bool) -> list[Face]:
     """Faces of an image and of its mirror image; with ``twice`` the means of those in both."""
-    found = _detected(photo)
+    result = _detected(photo)
     mirrored = [_mirrored(face, photo.shape[1]) for face in _detected(np.ascontiguousarray(photo[:, ::-1]))]
     if not twice:
-        return _distinct(found + mirrored)
+        return _distinct(result + mirrored)
     faces = []
-    for face in found:
+    for face in result:
         twin = max(mirrored, key=lambda other: _overlap(face, other), default=None)
         if twin is not None and _overlap(face, twin) > SAME_FACE:
             box = tuple(np.mean([face.box, twin.box], axis=0).tolist())
@@ -131,23 +131,23 @@ def _distinct(faces: list[Face]) -> list[Face]:
 def _checked(photo: UInt8[np.ndarray, "h w 3"], face: Face) -> Face:
     """The face as it is found in cuts around it, upright, on average; rejected where the first has none."""
     frame = frame_of(face, UTKFACE)
-    found = _in_cut(photo, frame, CUTS[0])
-    if found is None:
+    result = _in_cut(photo, frame, CUTS[0])
+    if result is None:
         return replace(face, rejected="not found again where it is cut out upright")
-    if found.confidence < CONFIDENT:
-        return replace(found, rejected=f"confidence {found.confidence:.2f} is below {CONFIDENT}")
-    again = [found, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
-    return replace(found, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
+    if result.confidence < CONFIDENT:
+        return replace(result, rejected=f"confidence {result.confidence:.2f} is below {CONFIDENT}")
+    again = [result, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
+    return replace(result, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
 
 
 def _in_cut(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, share: float) -> Face | None:
     """The face nearest to the middle of a cut ``share`` times as large as a frame; None for none."""
     frame = replace(frame, side=frame.side * share)
     cut = np.ascontiguousarray(frame.cut(photo, CUT_SIZE).transpose(1, 2, 0))
-    found = _both_ways(cut, twice=True)
-    if not found:
+    result = _both_ways(cut, twice=True)
+    if not result:
         return None
-    face = min(found, key=lambda one: float(np.abs(one.points.mean(axis=0) - CUT_SIZE / 2).max()))
+    face = min(result, key=lambda one: float(np.abs(one.points.mean(axis=0) - CUT_SIZE / 2).max()))
     angle = radians(frame.roll_deg)
     turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]]) * frame.side / CUT_SIZE
     left, top, right, bottom = face.box
@@ -178,12 +178,12 @@ def _detected(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
     if min(photo.shape[:2]) < SMALLEST_FACE:
         return []
     faces = []
-    for found in detector().detect_faces(photo):
-        left, top, across, down = found["box"]
-        points = np.array([found["keypoints"][name] for name in POINTS], np.float32) + 0.5
+    for result in detector().detect_faces(photo):
+        left, top, across, down = result["box"]
+        points = np.array([result["keypoints"][name] for name in POINTS], np.float32) + 0.5
         if min(across, down) > 0:
             box = float(left), float(top), float(left + across), float(top + down)
-            faces.append(Face(box, points, float(found["confidence"])))
+            faces.append(Face(box, points, float(result["confidence"])))
     return faces
 
 

@@ -142,8 +142,8 @@ def write_video(
             writer.close()
             sounds = [] if sound is None else ["-i", str(sound), "-map", "0:v", "-map", "1:a?", "-c:a", "aac"]
             words = ["-i", silent, *sounds, "-c:v", "copy", "-movflags", "+faststart", "-f", "mp4", "-y"]
-            told = [get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", *words, str(temporary)]
-            subprocess.run(told, check=True, capture_output=True)
+            words = [get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", *words, str(temporary)]
+            subprocess.run(words, check=True, capture_output=True)
         except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
             raise ValueError(f"ffmpeg cannot write {out}: {str(error).splitlines()[0]}") from error
 
@@ -172,11 +172,11 @@ def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 
 def _tracked(pixels: np.ndarray, model: Derenderer, places: Mapping[int, Frame]) -> Frame | None:
     """The frame of the face nearest to the last one, of the largest at first; None where there is none."""
-    found = [frame_of(face, template_of(model) or UTKFACE) for face in find_faces(pixels)]
-    if not found or not places:
-        return found[0] if found else None
+    results = [frame_of(face, template_of(model) or UTKFACE) for face in find_faces(pixels)]
+    if not results or not places:
+        return results[0] if results else None
     last = places[max(places)]
-    nearest = min(found, key=lambda one: np.hypot(one.x - last.x, one.y - last.y))
+    nearest = min(results, key=lambda one: np.hypot(one.x - last.x, one.y - last.y))
     return nearest if np.hypot(nearest.x - last.x, nearest.y - last.y) < 1.5 * last.side else None
 
 

@@ -114,11 +114,11 @@ class EmbeddingModel(nn.Module):
         `coordinates_of`.
         """
         check_images(images, self.image_size)
-        found = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
+        result = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
         if self.features.fits_scenes:
             fitted = self._fitted(images, self.features.required_fitting().settings.steps).coordinates
-            found |= {coordinates_of(name): value for name, value in fitted.items()}
-        return found
+            result |= {coordinates_of(name): value for name, value in fitted.items()}
+        return result
 
     def factor_activations(
         self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None
@@ -170,8 +170,8 @@ class EmbeddingModel(nn.Module):
             further = list(zip([row.parameter for row in rows], raws, ranged, strict=True))
             return fitting.fit(portion, scene, self.render, steps, further)
 
-        found = Fitted.joined(_by_portions(fitted, images), len(images))
-        return replace(found, scene=self.balanced(found.scene))
+        result = Fitted.joined(_by_portions(fitted, images), len(images))
+        return replace(result, scene=self.balanced(result.scene))
 
 
 def gradient_directions(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n directions"]:

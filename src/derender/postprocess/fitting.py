@@ -131,9 +131,9 @@ class Fitting(nn.Module):
 
         def rendered() -> tuple[Scene, Tensor, list[Tensor]]:
             """The present scenes, the error of each, and their coordinates."""
-            *found, light, camera = (moved * rates).split(sizes, dim=1)
-            found, raws = found[:2], found[2:]
-            depth, albedo = map(self.maps.maps, PARAMETERS.values(), found)
+            *result, light, camera = (moved * rates).split(sizes, dim=1)
+            result, raws = result[:2], result[2:]
+            depth, albedo = map(self.maps.maps, PARAMETERS.values(), result)
             own = {name: ranged(raw.tanh()) for (name, _, ranged), raw in zip(further, raws, strict=True)}
             values = {"depth": depth, "albedo": albedo.clamp(0, 1), "camera": camera, **scene.extra, **own}
             present = Scene.from_parameters(values if "environment" in values else values | {"light": light})
@@ -141,14 +141,14 @@ class Fitting(nn.Module):
             apart = (rendering.image - images).abs().mean(dim=1)
             beyond = (apart - self.settings.tolerance).clamp(min=0)
             limited, covered = (apart - (1 - _BEYOND) * beyond).flatten(1), rendering.mask.flatten(1)
-            return present, (limited * covered).sum(dim=1) / covered.sum(dim=1).clamp(min=1), found
+            return present, (limited * covered).sum(dim=1) / covered.sum(dim=1).clamp(min=1), result
 
         before = torch.empty(0)
         for step in range(steps):
             rate, count = _LATE_RATE if step >= _LATE * steps else 1.0, moved.new_tensor(step + 1.0)
-            _, error, found = rendered()
+            _, error, result = rendered()
             before = error.detach() if step == 0 else before
-            usual = torch.stack([value.square().mean(dim=1) for value in found]).sum(dim=0)
+            usual = torch.stack([value.square().mean(dim=1) for value in result]).sum(dim=0)
             loss = (error / _NOISE + self.settings.prior * usual).sum()
             (gradient,) = torch.autograd.grad(loss, moved)
             with torch.no_grad():
@@ -158,8 +158,8 @@ class Fitting(nn.Module):
                 )  # fmt: skip
                 moved.clamp_(low / rates, high / rates)
         with torch.no_grad():
-            fitted, after, found = rendered()
-        return Fitted(fitted.detach(), dict(zip(PARAMETERS, found, strict=True)), before, after)
+            fitted, after, result = rendered()
+        return Fitted(fitted.detach(), dict(zip(PARAMETERS, result, strict=True)), before, after)
 
     def save(self, file: Path) -> None:
         """Write it; complete or not at all."""

@@ -56,8 +56,8 @@ class MorphableMaps(nn.Module):
         """Of the nearest map the model has; an axis without length has coordinate 0."""
         mean, axes = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_axes").flatten(1)
         squared = axes.square().sum(dim=1)
-        found = (maps - mean).flatten(1) @ axes.T
-        return torch.where(squared > 0, found / squared.clamp(min=torch.finfo(squared.dtype).tiny), 0.0)
+        result = (maps - mean).flatten(1) @ axes.T
+        return torch.where(squared > 0, result / squared.clamp(min=torch.finfo(squared.dtype).tiny), 0.0)
 
 
 def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor, " k"], Float[Tensor, "k d"]]:
@@ -68,8 +68,8 @@ def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor,
     count = min(count, rows, columns)
     wide = columns > rows
     gram = (centred @ centred.T if wide else centred.T @ centred).double().cpu().numpy()
-    found = eigh(gram, subset_by_index=[len(gram) - count, len(gram) - 1])
-    variances, vectors = (torch.from_numpy(part.copy()).flip(-1) for part in found)
+    result = eigh(gram, subset_by_index=[len(gram) - count, len(gram) - 1])
+    variances, vectors = (torch.from_numpy(part.copy()).flip(-1) for part in result)
     directions = vectors.T.to(centred)
     if wide:
         directions = directions @ centred

@@ -94,6 +94,6 @@ def _checked(depth: Tensor, **others: tuple[Tensor, int]) -> list[Tensor]:
     for what in ("dtype", "device"):
         kinds = [getattr(value, what) for value in values.values()]
         if any(kind != kinds[0] for kind in kinds):
-            found = ", ".join(f"{name} {kind}" for name, kind in zip(values, kinds, strict=True))
-            raise ValueError(f"render: inputs must all have one {what}, got {found}")
+            result = ", ".join(f"{name} {kind}" for name, kind in zip(values, kinds, strict=True))
+            raise ValueError(f"render: inputs must all have one {what}, got {result}")
     return list(values.values())

@@ -113,12 +113,12 @@ def _imported(name: str, settings: str | None) -> Renderer:
     if module.partition(".")[0] in sys.stdlib_module_names or ".__main__" in module:  # a stranger's
         raise ValueError(f"no renderer {name!r}: it names a module of Python itself or a program")
     try:
-        found = getattr(importlib.import_module(module), thing)
+        result = getattr(importlib.import_module(module), thing)
     except (Exception, SystemExit) as error:  # whatever a module does when it is imported
         raise ValueError(
             f"no renderer {name!r} ({error!r}): put the folder of {module.partition('.')[0]} on PYTHONPATH, "
             "or install it"
         ) from error
-    if not isinstance(found, Renderer):
-        raise ValueError(f"{name!r} is a {type(found).__name__}, not a derender.renderers.Renderer")
-    return replace(found, name=name)
+    if not isinstance(result, Renderer):
+        raise ValueError(f"{name!r} is a {type(result).__name__}, not a derender.renderers.Renderer")
+    return replace(result, name=name)

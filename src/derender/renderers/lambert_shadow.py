@@ -46,8 +46,8 @@ def visible(
             search = _lowest_step
         step = search(depth, towards, focal_px(depth.shape[2], fov_deg))
     places = step.nonzero(as_tuple=True)  # usually few
-    found = clearance(depth, towards, places, step[places], focal_px(depth.shape[2], fov_deg))
-    share = (1 + found / math.tan(math.radians(softness_deg))).clamp(0, 1)
+    result = clearance(depth, towards, places, step[places], focal_px(depth.shape[2], fov_deg))
+    share = (1 + result / math.tan(math.radians(softness_deg))).clamp(0, 1)
     return torch.ones_like(depth).index_put(places, share * share * (3 - 2 * share))
 
 
@@ -99,8 +99,8 @@ def _lowest_step(
         places, numbers = tuple(axis[under] for axis in places), numbers[under]
         if not len(numbers):
             break
-        found = clearance(depth, towards, places, numbers, focal)
-        lower = found < lowest[places]
-        lowest[places] = torch.where(lower, found, lowest[places])
+        result = clearance(depth, towards, places, numbers, focal)
+        lower = result < lowest[places]
+        lowest[places] = torch.where(lower, result, lowest[places])
         step[places] = torch.where(lower, number, step[places])
     return step

@@ -170,10 +170,10 @@ def card_matrices(card: DisentanglementCard) -> list[Matrix]:
         note = "held out; best: one dark cell a column, in the right row"
         shown.append(("truth.score", "true factors: R2, accuracy of classes", note, first.truth.factors))
     whole = "best: white outside the blocks"
-    found = [Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole)]
+    results = [Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole)]
     for path, title, note, columns in shown:
-        found.append(Matrix(title, card.mean(path), names, columns, note=note))
-    return found
+        results.append(Matrix(title, card.mean(path), names, columns, note=note))
+    return results
 
 
 def write_card(card: DisentanglementCard, title: str, file: Path) -> None:

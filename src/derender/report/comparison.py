@@ -175,14 +175,14 @@ def set_tables(one: ScoredQuestion, methods: Sequence[str]) -> list[ScoreTable]:
         for place, column in enumerate(COST_COLUMNS.values())
     }
     table = scored_table(f"{one.name}: {one.about}", "features", rows, one.columns, more=costs)
-    found = {row.name: row for row in table.rows}
+    result = {row.name: row for row in table.rows}
     blank = [None] * (len(table.columns) - 1 - len(COST_COLUMNS))
-    for name in one.absent.keys() - found.keys():
+    for name in one.absent.keys() - result.keys():
         why = shorten(one.absent[name], 60, placeholder=" ...")  # the page and the Markdown say it whole
-        found[name] = Row(name, (why, *blank, *_cost_cells(one.costs.get(name, {}))))
+        result[name] = Row(name, (why, *blank, *_cost_cells(one.costs.get(name, {}))))
     order = dict.fromkeys((*methods, *one.rows))
     verdict = verdict_table(rows, one.columns, f"{one.name}, above the strongest control? {one.about}")
-    return [replace(table, rows=[found[name] for name in order if name in found]), verdict]
+    return [replace(table, rows=[result[name] for name in order if name in result]), verdict]
 
 
 def protocol_picture(scores: Sequence[ScoredQuestion], methods: Sequence[str]) -> tuple[str, bytes]:

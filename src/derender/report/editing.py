@@ -77,18 +77,18 @@ class WrittenImages:
         if self.unlike:
             first = next(path for path, at in self.percentiles.items() if at > OUTLIER_PERCENTILE)
             lines.append(f"{self.unlike}; {first} is one")
-        found = Counter(part["found"] for part in self.framing.values())
-        faces = found["face"] + found["profile"]
-        if faces or found["no face"]:
-            lines.append(f"a face was found in {faces:,} of {found.total():,} images")
+        result = Counter(part["found"] for part in self.framing.values())
+        faces = result["face"] + result["profile"]
+        if faces or result["no face"]:
+            lines.append(f"a face was found in {faces:,} of {result.total():,} images")
         for what, then in NOTED.items():
-            if count := found[what]:
+            if count := result[what]:
                 first = next(path for path, part in self.framing.items() if part["found"] == what)
                 lines.append(f"{then.format(count=count)} ({first} for one)")
-        if found["auto"]:
+        if result["auto"]:
             sides = [100 * part["side"] for part in self.framing.values() if part["side"] < 1]
             share = f", {_span(sides)} % of their side" if sides else ""
-            lines.append(f"shown in part{share}: {len(sides):,} of {found['auto']:,} images")
+            lines.append(f"shown in part{share}: {len(sides):,} of {result['auto']:,} images")
         return lines
 
     def values(self) -> dict[str, Any]:

@@ -194,9 +194,9 @@ def _scores(subject: Subject) -> Values:
 def _card(subject: Subject) -> Values:
     """The disentanglement card from one seed, without scores by dimension."""
     sample = _sample(subject.held_out, CARD)
-    found = disentangle(subject.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
-    sheet = matrix_sheet(card_matrices(found.result))
-    return {"notes": ". ".join(found.notes[:2]), "tables": found.tables[:3], "matrices": sheet}
+    result = disentangle(subject.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)))
+    sheet = matrix_sheet(card_matrices(result.result))
+    return {"notes": ". ".join(result.notes[:2]), "tables": result.tables[:3], "matrices": sheet}
 
 
 def _explained(subject: Subject) -> Values:
@@ -210,8 +210,8 @@ def _explained(subject: Subject) -> Values:
     split = choose_rows(task, sample.files, (max(2, int(0.4 * task.known.sum())),), (0,))
     table = embed_image_set(subject.model, sample)
     fresh = untrained_features(subject.model, sample, seed=0).factors
-    found = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
-    shares = share_values(found, share_chart(found)[0])
+    result = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
+    shares = share_values(result, share_chart(result)[0])
     return {"count": f"{len(sample):,}", "names": ", ".join(names), "shares": shares}
 
 

@@ -171,17 +171,17 @@ def explanation_page(
     return Page("explanation.html", "Which factor made the answer", lead, values)
 
 
-def share_values(found: Explanation, chart: str) -> dict[str, Any]:
+def share_values(result: Explanation, chart: str) -> dict[str, Any]:
     """What ``templates/shares.html`` shows: verdicts, the chart of the shares (SVG text) and their tables."""
-    shown = [tables.share_table(found), tables.drop_table(found)]
-    return {"verdicts": tables.share_verdicts(found), "chart": chart, "tables": shown}
+    shown = [tables.share_table(result), tables.drop_table(result)]
+    return {"verdicts": tables.share_verdicts(result), "chart": chart, "tables": shown}
 
 
-def share_chart(found: Explanation) -> tuple[str, bytes]:
+def share_chart(result: Explanation) -> tuple[str, bytes]:
     """SVG text for a page, and the same as PNG."""
-    model, *controls = found.rows
-    places = np.arange(len(found.names))[::-1]
-    names = [name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…" for name in found.names]
+    model, *controls = result.rows
+    places = np.arange(len(result.names))[::-1]
+    names = [name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…" for name in result.names]
 
     def draw(axes: Axes, factor: int) -> None:
         shares = model.shares[:, :, factor]
@@ -200,5 +200,5 @@ def share_chart(found: Explanation) -> tuple[str, bytes]:
         axes.grid(True, axis="x")
         axes.set_axisbelow(True)
 
-    panels = {name: at for at, name in enumerate(found.factors)}
+    panels = {name: at for at, name in enumerate(result.factors)}
     return side_by_side(panels, draw, "share of |IG|", (1.6 + 2.0 * len(panels), 1.3 + 0.24 * len(places)))

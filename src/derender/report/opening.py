@@ -108,12 +108,12 @@ class ImageOpener:
     def read(self, path: Path) -> Read:
         """Read a file; no image, or no face where one was asked for, is a ValueError or OSError."""
         photo = read_photo(path)
-        frame, found = found_frame(photo, self.model, self.options.frame)
+        frame, result = found_frame(photo, self.model, self.options.frame)
         middle = Frame.centred(photo.shape[1], photo.shape[0])
         place = {"x": frame.x, "y": frame.y, "side_px": frame.side, "roll_deg": frame.roll_deg}
-        framing = {**frame.within(middle), **place, "found": found}
+        framing = {**frame.within(middle), **place, "found": result}
         pixels = frame.cut(photo, self.model.image_size)
-        judged = middle.cut(photo, self.model.image_size) if found == "auto" else pixels
+        judged = middle.cut(photo, self.model.image_size) if result == "auto" else pixels
         return pixels, frame, framing, judged
 
     def decomposed(self, read: Mapping[Path, Read]) -> list[OpenedImage]:
@@ -167,18 +167,18 @@ def readable(
     paths: Sequence[Path], read: Callable[[Path], T], progress: Callable[..., object] | None = None
 ) -> tuple[dict[Path, T], dict[str, str]]:
     """Every file that can be read, and reasons why the others cannot; none at all is an error."""
-    found: dict[Path, T] = {}
+    result: dict[Path, T] = {}
     refused: dict[str, str] = {}
     for number, path in enumerate(paths):
         if progress is not None:
             progress(number, len(paths), description="reading")
         try:
-            found[path] = read(path)
+            result[path] = read(path)
         except (ValueError, OSError) as problem:
             refused[str(path)] = " ".join(str(problem).split())
-    if refused and not found:
+    if refused and not result:
         raise ValueError(next(iter(refused.values())))
-    return found, refused
+    return result, refused
 
 
 def held_out_errors(source: str | Path) -> HeldOutErrors | None:

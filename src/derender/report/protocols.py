@@ -29,7 +29,7 @@ from derender.storage.atomic import write_whole
 CONTROL_LINES = ((0, (5, 2)), (0, (1, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)))
 
 
-def robustness_chart(found: RobustnessComparison, score: str = "accuracy") -> tuple[str, bytes]:
+def robustness_chart(result: RobustnessComparison, score: str = "accuracy") -> tuple[str, bytes]:
     """Every curve, a panel for each axis, as SVG text and as PNG."""
 
     def draw(axes: Axes, curve: CurveResult) -> None:
@@ -44,42 +44,42 @@ def robustness_chart(found: RobustnessComparison, score: str = "accuracy") -> tu
             low, high = [one.low for one in ends], [one.high for one in ends]
             axes.fill_between(curve.levels, low, high, color=SERIES[0], alpha=0.15, linewidth=0)
         axes.set_ylim(0, 1)
-        if len({one.levels for one in found.curves}) == 1:  # panels share their ticks
+        if len({one.levels for one in result.curves}) == 1:  # panels share their ticks
             axes.set_xticks(curve.levels)
         axes.grid(True)
-        if curve is found.curves[0]:
+        if curve is result.curves[0]:
             axes.set_ylabel(SCORES[score])
 
-    panels = {curve.title: curve for curve in found.curves}
+    panels = {curve.title: curve for curve in result.curves}
     size = (1.2 + 3.6 * max(2, len(panels)), 3.9)
     return side_by_side(panels, draw, "degrees off the front", size, columns=5)
 
 
-def robustness_page(found: RobustnessComparison, model: str, score: str = "accuracy") -> Page:
+def robustness_page(result: RobustnessComparison, model: str, score: str = "accuracy") -> Page:
     """Chart and tables on one page."""
     areas = [
         f"{curve.title}: {row.name} has the area {row.scores[AREA].value:.3f}"
-        for curve in found.curves
+        for curve in result.curves
         for row in curve.rows[score]
     ]
-    tables = found.tables(score)
-    own = {curve.title: tables[3 * at : 3 * at + 3] for at, curve in enumerate(found.curves)}
-    chart, score_name = robustness_chart(found, score)[0], SCORES[score].capitalize()
+    tables = result.tables(score)
+    own = {curve.title: tables[3 * at : 3 * at + 3] for at, curve in enumerate(result.curves)}
+    chart, score_name = robustness_chart(result, score)[0], SCORES[score].capitalize()
     return Page(
         "robustness.html",
         "Robustness to light and view",
-        f"{found.how.capitalize()}: learned in ordinary light and view, asked in others.",
+        f"{result.how.capitalize()}: learned in ordinary light and view, asked in others.",
         {"chart": chart, "alt": "; ".join(areas), "score": score_name, "tables": own},
         f"Model: {model}. Definitions: docs/reference/metrics.md.",
     )
 
 
-def write_curves(found: RobustnessComparison, score: str, model: str, file: Path) -> None:
+def write_curves(result: RobustnessComparison, score: str, model: str, file: Path) -> None:
     """Write the chart (.svg, .png) or the page (.html)."""
     if file.suffix.lower() == ".html":
-        robustness_page(found, model, score).write(file)
+        robustness_page(result, model, score).write(file)
         return
-    svg, png = robustness_chart(found, score)
+    svg, png = robustness_chart(result, score)
     write_whole(file, png if file.suffix.lower() == ".png" else svg.encode())
 
 
@@ -134,11 +134,11 @@ def segmentation_sheet(
     return sheet
 
 
-def write_overlays(found: SegmentationComparison, out: Path) -> Path:
+def write_overlays(result: SegmentationComparison, out: Path) -> Path:
     """Write the sheet of overlays; its name changes with the answers."""
-    answers = {row.scored.name: row.shown for row in found.rows if row.trainable}
-    images, truth = found.data.images[found.shown], found.data.masks[found.shown]
-    sheet = segmentation_sheet(images, truth, answers, found.data.classes)
+    answers = {row.scored.name: row.shown for row in result.rows if row.trainable}
+    images, truth = result.data.images[result.shown], result.data.masks[result.shown]
+    sheet = segmentation_sheet(images, truth, answers, result.data.classes)
     mark = content_hash({"pictures": images, "mask": truth, **answers})[:8]
     return write_whole(out / f"overlays-{mark}.png", png_bytes(sheet))
 

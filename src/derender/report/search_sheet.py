@@ -16,7 +16,7 @@ CELL = 192
 
 
 def search_sheet(
-    found: Found,
+    result: Found,
     out: Path,
     images: str | None = None,
     *,
@@ -31,12 +31,12 @@ def search_sheet(
     Raises:
         ValueError: the address is not known, or holds none of the images.
     """
-    address = images if images is not None else str(found.table.origin.get("data", ""))
+    address = images if images is not None else str(result.table.origin.get("data", ""))
     if not address:
         raise ValueError("the table does not record where its images are: give their address")
-    captions = {found.table.files[row]: "query" for row in [found.own_row] if row is not None}
-    for row, distance in zip(found.rows, found.distances, strict=True):
-        captions.setdefault(found.table.files[row], f"{distance:.3f}")
+    captions = {result.table.files[row]: "query" for row in [result.own_row] if row is not None}
+    for row, distance in zip(result.rows, result.distances, strict=True):
+        captions.setdefault(result.table.files[row], f"{distance:.3f}")
     missing, read = set(captions), {}
     with open_images(address, dataset=dataset) as stream, quiet_pillow():
         for sample in stream.samples():
@@ -51,10 +51,10 @@ def search_sheet(
     if not read:
         some = list(captions)[-1]
         raise ValueError(f"{address} holds none of the images found, such as {some!r}: give another address")
-    shown = [] if found.own_row is not None else [("query", read_image(Path(found.like), CELL))]
+    shown = [] if result.own_row is not None else [("query", read_image(Path(result.like), CELL))]
     shown += [(caption, read[file]) for file, caption in captions.items() if file in read]
     names, drawn = [caption for caption, _ in shown], pictures(np.stack([image for _, image in shown]))
-    title, layout = f"nearest by {found.factor}", GridLayout(cell=CELL)
+    title, layout = f"nearest by {result.factor}", GridLayout(cell=CELL)
     sheet = contact_sheet(drawn, names, across=7, title=title, layout=layout)
     write_whole(out, png_bytes(sheet))
     return [file for file in captions if file not in read]

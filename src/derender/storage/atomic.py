@@ -114,8 +114,8 @@ def remove_abandoned(path: Path) -> None:
 
 def seal(folder: Path) -> None:
     """Note size and CRC-32 of every file in a folder beside them, and have the disk keep all of it."""
-    found = {file.name: measured(file) for file in sorted(folder.iterdir())}
-    (folder / CHECKSUMS).write_text(json.dumps({"crc32": found}))
+    result = {file.name: measured(file) for file in sorted(folder.iterdir())}
+    (folder / CHECKSUMS).write_text(json.dumps({"crc32": result}))
     for file in (*folder.iterdir(), folder):
         _to_disk(file)
 
@@ -131,11 +131,11 @@ def check_seal(folder: Path) -> None:
     for name, (size, checksum) in noted.items():
         try:
             file = folder / Path(name).name
-            found = measured(file) if file.stat().st_size == size else (file.stat().st_size, 0)
+            result = measured(file) if file.stat().st_size == size else (file.stat().st_size, 0)
         except OSError as error:
             raise Damaged(f"{name} is missing or cannot be read") from error
-        if found != (size, checksum):
-            how = "its checksum differs" if found[0] == size else f"{found[0]:,} of {size:,} bytes"
+        if result != (size, checksum):
+            how = "its checksum differs" if result[0] == size else f"{result[0]:,} of {size:,} bytes"
             raise Damaged(f"{name} has changed since it was written: {how}")
 
 

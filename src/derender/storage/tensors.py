@@ -104,12 +104,12 @@ def require_plain(tensors: Mapping[str, Any], file: Path) -> None:
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:
     """Eight hexadecimal digits that change with any name, kind, shape or bit."""
-    found = 0
+    result = 0
     for name, value in sorted(tensors.items()):
-        found = zlib.crc32(f"{name} {value.dtype} {tuple(value.shape)}\0".encode(), found)
+        result = zlib.crc32(f"{name} {value.dtype} {tuple(value.shape)}\0".encode(), result)
         if value.numel():
-            found = zlib.crc32(value.contiguous().reshape(-1).view(torch.uint8).numpy().data, found)
-    return f"{found:08x}"
+            result = zlib.crc32(value.contiguous().reshape(-1).view(torch.uint8).numpy().data, result)
+    return f"{result:08x}"
 
 
 def reads_safely() -> bool:

@@ -154,12 +154,12 @@ def _fit_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]
     A state of other parameters is a ValueError: a fused step goes by their size alone.
     """
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    found: dict[int, dict[str, Tensor]] = {}
+    result: dict[int, dict[str, Tensor]] = {}
     for key, value in moments.items():
         index, _, name = key.partition(".")
-        found.setdefault(int(index), {})[name] = value
+        result.setdefault(int(index), {})[name] = value
     optimiser.state.clear()
-    for index, entries in found.items():
+    for index, entries in result.items():
         if not 0 <= index < len(parameters) or entries.keys() != {"step", *_MOMENTS}:
             raise ValueError(f"the optimiser's state {index} holds {', '.join(sorted(entries))}")
         own = parameters[index]

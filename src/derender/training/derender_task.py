@@ -64,8 +64,8 @@ def _add_features(
     split = split_indices(images.files, config.split, seed=config.seed)
     mapped = isinstance(images.images, np.memmap)
     some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
-    told = Progress.of("features", report)
-    model = make_features(model, some, config.features, seed=config.seed, progress=told)
+    phase = Progress.of("features", report)
+    model = make_features(model, some, config.features, seed=config.seed, progress=phase)
     write_config(out, [factor.name for factor in model.factors], model.settings)
     model.features.save(out)
     held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]

@@ -163,8 +163,8 @@ class FittedScenes:
         """All but the share with the largest errors, and those that are not finite or out of the image."""
         columns = (*self.values.values(), self.error)
         finite = torch.stack([value.isfinite().reshape(len(value), -1).all(dim=1) for value in columns])
-        found = finite.all(dim=0) & (self.error > 0)  # where nothing is rendered there is no error
-        return found & (self.error <= self.error.quantile(1 - worst))
+        result = finite.all(dim=0) & (self.error > 0)  # where nothing is rendered there is no error
+        return result & (self.error <= self.error.quantile(1 - worst))
 
     def scene(self, maps: MorphableMaps) -> Scene:
         fitted = {name: maps.maps(name, self.values[name]) for name in PARAMETERS.values()}
@@ -178,9 +178,9 @@ def fit_scenes(
     model = model.with_brightness(None)  # coordinates are of albedos as decoded
     parts: list[dict[str, Tensor]] = []
     for start in range(0, len(images), _FIT_BATCH):
-        found = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
-        own = {parameter: found.coordinates[name] for name, parameter in PARAMETERS.items()}
-        parts.append({"error": found.after, **found.scene.parameters, **own})
+        result = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
+        own = {parameter: result.coordinates[name] for name, parameter in PARAMETERS.items()}
+        parts.append({"error": result.after, **result.scene.parameters, **own})
         report(min(start + _FIT_BATCH, len(images)), len(images))
     values = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     return FittedScenes(values, values.pop("error"))

@@ -80,10 +80,10 @@ class Ranks:
 
     def _everyone(self, value: Any) -> list[Any]:
         """The values of all ranks in order."""
-        found: list[Any] = [value] * self.count
+        result: list[Any] = [value] * self.count
         if self.count > 1:
-            distributed.all_gather_object(found, value)
-        return found
+            distributed.all_gather_object(result, value)
+        return result
 
 
 ALONE = Ranks()

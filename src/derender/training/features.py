@@ -77,14 +77,14 @@ def make_features(
 @torch.no_grad()
 def fit_brightness(model: Derenderer, images: Shaped[Tensor, "n 3 h w"]) -> BrightnessPrior | None:
     """The prior of brightness over the first images; None for fewer than four or another kind of scene."""
-    model, found = model.with_brightness(None), []
+    model, result = model.with_brightness(None), []
     moves = model.renderer.specular is not None or model.renderer.gamma != 1  # brightness would change images
     if len(images) < 4 or moves or {"light", "albedo"} - {factor.parameter for factor in model.factors}:
         return None
     with evaluating(model):
         for _, batch in _batches(model, images, torch.arange(min(len(images), BRIGHTNESS_IMAGES)), None):
-            found.append(brightness_cues(model.decompose(batch)).cpu())
-    return BrightnessPrior.of(torch.cat(found))
+            result.append(brightness_cues(model.decompose(batch)).cpu())
+    return BrightnessPrior.of(torch.cat(result))
 
 
 @torch.no_grad()

@@ -95,17 +95,17 @@ def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
     if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):
         return ""
-    found = []
+    results = []
     for name in bundled_models():
         known, model = read_errors(model_folder(name)), load(name)
         if known is not None and model.image_size == images.shape[-1]:
-            found.append((float(np.median(reconstruction_percentile(model, images[odd], known))), name))
+            results.append((float(np.median(reconstruction_percentile(model, images[odd], known))), name))
     line = (
         f"{len(odd):,} of {len(percentiles):,} images are reconstructed worse than {OUTLIER_PERCENTILE:g} % "
         "of those this model was validated on: another kind of object, or another crop "
         "(derender align, --frame)"
     )
-    worse, best = min(found, default=(100.0, ""))
+    worse, best = min(results, default=(100.0, ""))
     if worse < FITTING:
         return f"{line}; {best} fits better (worse than {worse:.0f} % of its own): try --model {best}"
     return line

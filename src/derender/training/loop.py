@@ -100,9 +100,9 @@ class _Run:
         self.model: Any = task.build().to(fabric.device)
         if config.channels_last:
             self.model.to(memory_format=torch.channels_last)
-        told = Progress.of("perceptual", self.report)
+        phase = Progress.of("perceptual", self.report)
         with fabric.rank_zero_first():
-            step = task.step_module(self.model, self.folder, batches.sample(), told)
+            step = task.step_module(self.model, self.folder, batches.sample(), phase)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
         self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True)

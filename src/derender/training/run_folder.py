@@ -131,9 +131,9 @@ def read_settings(
             raise ValueError("no settings by name")
     except ValueError as error:
         raise ValueError(f"{file} {otherwise} ({error})") from error
-    found = tree.pop("format", FORMAT)
-    if not isinstance(found, int) or found > FORMAT:
-        shown = Repr().repr(found)
+    result = tree.pop("format", FORMAT)
+    if not isinstance(result, int) or result > FORMAT:
+        shown = Repr().repr(result)
         raise ValueError(
             f"{file} was written in format {shown}, this version reads up to {FORMAT}: update derender"
         )

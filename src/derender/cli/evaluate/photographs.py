@@ -26,8 +26,8 @@ class Decomposed(options.TrainedModel):
     ) -> None:
         """Score by a protocol of `derender.evaluation`, and publish."""
         how |= {"fit_steps": self.fit_steps, "resamples": self.resamples, "seed": self.seed, **images.how}
-        found = scoring.measured(protocol, self.open(), images.address, doing="decomposing", **how)
-        published.publish(found, half=images.half)
+        result = scoring.measured(protocol, self.open(), images.address, doing="decomposing", **how)
+        published.publish(result, half=images.half)
 
 
 def pose(

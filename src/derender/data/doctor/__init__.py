@@ -123,34 +123,36 @@ def findings_of(
     values: Mapping[str, JackknifeEstimate], details: Mapping[str, str], axis: measures.SymmetryAxis | None
 ) -> tuple[CheckFinding, ...]:
     """A finding for every value; without an axis nothing was compared, and the rest stays open."""
-    found = {name: finding_of(name, values[name], details.get(name, "")) for name in CHECKS if name in values}
+    result = {
+        name: finding_of(name, values[name], details.get(name, "")) for name in CHECKS if name in values
+    }
     if axis is None:
         text = "Alignment, kinds, symmetry and variety were not measured: too few distinct images."
-        return (*found.values(), CheckFinding("the rest", "open", text))
+        return (*result.values(), CheckFinding("the rest", "open", text))
     if values["agreement"].value < (CHECKS["agreement"].objects or 0):
         text = "Kinds, symmetry, crop, view and light cannot be judged where images have so little in common."
-        counted = list(found)[: list(found).index("agreement") + 1]
-        return (*(found[name] for name in counted), CheckFinding("the rest", "open", text))
-    if "kinship" not in found:
-        found["kinship"] = CheckFinding("kinds", "open", "No two groups are large enough to compare.")
-    off = found["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
+        counted = list(result)[: list(result).index("agreement") + 1]
+        return (*(result[name] for name in counted), CheckFinding("the rest", "open", text))
+    if "kinship" not in result:
+        result["kinship"] = CheckFinding("kinds", "open", "No two groups are large enough to compare.")
+    off = result["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
     name = "symmetry" if off else "fill"
-    if abs(axis.offset) >= AXIS_OFFSET and (off or found[name].level == "good"):
+    if abs(axis.offset) >= AXIS_OFFSET and (off or result[name].level == "good"):
         side = "right" if axis.offset > 0 else "left"
         where = f"Their axis of symmetry lies {percent(abs(axis.offset))} of the width {side} of the middle."
-        found[name] = replace(
-            found[name],
-            level=found[name].level if off else "trouble",
-            text=f"{found[name].text} {where}",
+        result[name] = replace(
+            result[name],
+            level=result[name].level if off else "trouble",
+            text=f"{result[name].text} {where}",
             advice=f"Crop further to the {side}, so that the axis is in the middle.",
             short="the axis of symmetry is off the middle",
         )
-    if found["light"].level == "objection":  # where both are missing, nothing is left to learn a shape from
+    if result["light"].level == "objection":  # where both are missing, nothing is left to learn a shape from
         view = values["view"]
         missing = view.value + 2 * view.error < (CHECKS["view"].struggles or 0)
         name, level = ("view", "objection") if missing else ("light", "trouble")
-        found[name] = replace(found[name], level=level)
-    return tuple(found.values())
+        result[name] = replace(result[name], level=level)
+    return tuple(result.values())
 
 
 def percent(share: float) -> str:
@@ -280,8 +282,8 @@ def doctor(
     values = {name: JackknifeEstimate(float(value)) for name, value in shares.items()}
     values |= {} if shared is None else shared.values
     findings = findings_of(values, details, None if shared is None else shared.axis)
-    found = verdict_of(findings), findings, values, group, identical, originals, shared
-    return Examination(images, *found, _examples(pixels, group, shared))
+    result = verdict_of(findings), findings, values, group, identical, originals, shared
+    return Examination(images, *result, _examples(pixels, group, shared))
 
 
 def quick_verdict(images: ImageSet) -> str:

@@ -289,13 +289,13 @@ def symmetry_axis(grey: Grey) -> SymmetryAxis:
     mean = np.sqrt(np.hypot(right, down)).mean(axis=0, dtype=np.float64)
     mean -= mean.mean(axis=1, keepdims=True)
     width = mean.shape[1]
-    found: dict[int, float] = {}
+    result: dict[int, float] = {}
     for twice in range(-_REACH, _REACH + 1):  # twice the distance, in pixels of the small image
         part = mean[:, max(0, twice) : min(width, width + twice)]
         part = part - part.mean(axis=1, keepdims=True)
-        found[twice] = float((part * part[:, ::-1]).sum() / max(float((part**2).sum()), 1e-12))
-    best = max(found, key=lambda twice: (found[twice] - _MARGIN * (twice != 0), -abs(twice)))
-    return SymmetryAxis(best / 2 / width, found[best])
+        result[twice] = float((part * part[:, ::-1]).sum() / max(float((part**2).sum()), 1e-12))
+    best = max(result, key=lambda twice: (result[twice] - _MARGIN * (twice != 0), -abs(twice)))
+    return SymmetryAxis(best / 2 / width, result[best])
 
 
 def likeness(structure: Cells) -> Float[np.ndarray, " n"]:

@@ -184,14 +184,14 @@ def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.nd
 def parts_of(source: Source) -> dict[str, dict[int, str]]:
     """The files of every mask in parts, by class number, under the mask's name (FOLDER/NUMBER_*.png)."""
     numbers = {name: number for number, name in enumerate(MASK_CLASSES) if number}
-    found: dict[str, dict[int, str]] = {}
+    result: dict[str, dict[int, str]] = {}
     for file in source.files:
         if file.endswith(".png"):
             folder, _, name = file.rpartition("/")
             digits, _, part = name.removesuffix(".png").partition("_")
             if part in numbers and digits.isdecimal():
-                found.setdefault(f"{folder}/{digits}_*.png", {})[numbers[part]] = file
-    return found
+                result.setdefault(f"{folder}/{digits}_*.png", {})[numbers[part]] = file
+    return result
 
 
 def _mask_images(source: Source) -> tuple[str, ...]:

@@ -48,26 +48,26 @@ _NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
 def load_utkface(source: Source) -> Table | None:
     """Age, gender and race from the names; values outside the published codes count as unknown."""
-    found = [UTK_NAME.match(base_name(file)) for file in source.images]
-    if source.images and not any(found):
+    results = [UTK_NAME.match(base_name(file)) for file in source.images]
+    if source.images and not any(results):
         return None
-    ages = [float(one["age"]) if one else np.nan for one in found]
+    ages = [float(one["age"]) if one else np.nan for one in results]
     labels = {"age": number_column(age if age <= _UTK_OLDEST else np.nan for age in ages)}
     for column, names in _UTK_CODES.items():
         by_code = dict(zip("01234", names, strict=False))
-        labels[column] = text_column(by_code.get(one[column] or "", "") if one else "" for one in found)
+        labels[column] = text_column(by_code.get(one[column] or "", "") if one else "" for one in results)
     return Table(source.images, labels)
 
 
 def load_yale(source: Source) -> Table:
     """Person, pose and light from the names; ``light_deg`` is the angle between light and view."""
-    found = {file: match for file in source.images if (match := YALE_NAME.fullmatch(base_name(file)))}
-    azimuth, elevation = (np.array([float(one[name]) for one in found.values()]) for name in ("a", "e"))
+    result = {file: match for file in source.images if (match := YALE_NAME.fullmatch(base_name(file)))}
+    azimuth, elevation = (np.array([float(one[name]) for one in result.values()]) for name in ("a", "e"))
     cosine = np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))
-    labels = {name: text_column(one[name] for one in found.values()) for name in ("identity", "pose")}
+    labels = {name: text_column(one[name] for one in result.values()) for name in ("identity", "pose")}
     labels |= {"light_azimuth_deg": number_column(azimuth), "light_elevation_deg": number_column(elevation)}
     labels["light_deg"] = number_column(np.degrees(np.arccos(cosine)).round(3))
-    return Table(tuple(found), labels)
+    return Table(tuple(result), labels)
 
 
 def load_lfw(source: Source) -> Table | None:
@@ -95,8 +95,10 @@ def load_lfw(source: Source) -> Table | None:
 
 def raf_list(source: Source) -> str | None:
     """The list of the basic set, shallowest first, or None."""
-    found = [file for file in source.files if file.endswith(_RAF_LISTS) and "compound" not in file.split("/")]
-    return min(found, key=lambda file: (file.count("/"), file), default=None)
+    results = [
+        file for file in source.files if file.endswith(_RAF_LISTS) and "compound" not in file.split("/")
+    ]
+    return min(results, key=lambda file: (file.count("/"), file), default=None)
 
 
 def load_rafdb(source: Source) -> Table | None:
@@ -130,8 +132,8 @@ def is_tracks(source: Source) -> bool:
 
 def _track_lists(source: Source) -> dict[str, str]:
     """Each list's file by its name (the episode)."""
-    found = {stem_of(file): file for file in reversed(source.files) if file.endswith(".ids")}
-    return dict(sorted(found.items()))
+    result = {stem_of(file): file for file in reversed(source.files) if file.endswith(".ids")}
+    return dict(sorted(result.items()))
 
 
 def load_tracks(source: Source) -> Table | None:

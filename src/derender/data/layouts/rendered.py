@@ -75,13 +75,13 @@ def rendered_folders(source: Source) -> list[str]:
 def pairs_of(source: Source) -> dict[str, str]:
     """Image to depth map, for every image in a folder ``image`` with a map in the folder beside it."""
     images = _images_in(source, "image")
-    known, found = set(source.files) if images else set(), {}
+    known, result = set(source.files) if images else set(), {}
     for file in images:
         stem, folder = stem_of(file), file.rpartition("/")[0].removesuffix("image")
         names = (f"{folder}depth/{name}.png" for name in (stem.replace("image", "depth"), stem))
         if (name := next((name for name in names if name in known), None)) is not None:
-            found[file] = name
-    return found
+            result[file] = name
+    return result
 
 
 def track_labels(files: Sequence[str], matches: Sequence[re.Match[str]]) -> Labels:
@@ -140,7 +140,7 @@ def load_rendered(source: Source) -> Table | None:
 
 def is_synface(source: Source) -> bool:
     """Whether the first params.csv is about faces: cars have a class."""
-    return "file" in (found := columns(source)) and "class" not in found
+    return "file" in (result := columns(source)) and "class" not in result
 
 
 def columns(source: Source) -> list[str]:
@@ -190,7 +190,7 @@ def is_cars(source: Source) -> bool:
 
 def load_cars(source: Source) -> Table | None:
     files = tuple(file for file in source.images if not _MAPS & set(file.split("/")[:-1]))
-    models = [found[0] if (found := _ID.search(file)) else "" for file in files]
+    models = [results[0] if (results := _ID.search(file)) else "" for file in files]
     partition = partition_column(map(partition_by_folder, files))
     if not any(models) and partition is None:
         return None
@@ -208,8 +208,8 @@ def load_cars(source: Source) -> Table | None:
                 f"{table} in {source.path} names none of the models there; ShapeNet's owners publish "
                 f"the table of cars ({_CARS}) at https://shapenet.org"
             )
-        found = [known.get(model, ("", "")) for model in models]
-        labels["name"], labels["class"] = map(text_column, zip(*found, strict=True))
+        results = [known.get(model, ("", "")) for model in models]
+        labels["name"], labels["class"] = map(text_column, zip(*results, strict=True))
     try:  # the published crop for every image if the first one has the published size
         published = bool(files) and upright_size(source.read(files[0])) == _PUBLISHED_SIZE
     except DECODER_ERRORS:

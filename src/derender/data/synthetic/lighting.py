@@ -53,7 +53,7 @@ def depths_seen(nearest):
 
 
 @kernel
-def light_at(lighting, place, normal, span, found):
+def light_at(lighting, place, normal, span, result):
     """Light on a point with an inward normal: fills ``found`` in the order of ``EFFECTS``.
 
     ``place`` is column, row, depth, focal length and side of the image; ``span`` the least and greatest depth
@@ -63,10 +63,10 @@ def light_at(lighting, place, normal, span, found):
     middle, (nx, ny, nz) = np.float32(0.5) * np.float32(size - 1), normal
     x, y = (u - middle) * z / focal_px, (v - middle) * z / focal_px
     away = _ONE / np.sqrt(x * x + y * y + z * z)
-    found[0], found[1], found[2], found[3] = lighting.ambient, _ONE, _ZERO, _ONE
+    result[0], result[1], result[2], result[3] = lighting.ambient, _ONE, _ZERO, _ONE
     if lighting.haze[0] > _ZERO and span[1] > span[0]:
         share = min(max((z - span[0]) / (span[1] - span[0]), _ZERO), _ONE)
-        found[3] = np.exp(-lighting.haze[0] * share)
+        result[3] = np.exp(-lighting.haze[0] * share)
     for number in range(len(lighting.lamps)):
         lamp = lighting.lamps[number]
         cosine = nx * lamp[1] + ny * lamp[2] + nz * lamp[3]
@@ -74,14 +74,14 @@ def light_at(lighting, place, normal, span, found):
         if cosine > _ZERO and len(lighting.maps):
             seen = _lit(lighting, number, cosine, x, y, z)
         if number == 0:
-            found[1] = seen
+            result[1] = seen
         if cosine <= _ZERO:
             continue
-        found[0] += lamp[0] * seen * cosine
+        result[0] += lamp[0] * seen * cosine
         hx, hy, hz = lamp[1] + x * away, lamp[2] + y * away, lamp[3] + z * away
         shine = (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
         if shine > _ZERO:
-            found[2] += lighting.gloss[0] * lamp[0] * seen * shine ** lighting.gloss[1]
+            result[2] += lighting.gloss[0] * lamp[0] * seen * shine ** lighting.gloss[1]
 
 
 @kernel

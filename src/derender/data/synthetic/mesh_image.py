@@ -233,8 +233,8 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
     inside = np.empty(_ALL, np.bool_)
     colour = np.empty((_ALL, 3), np.float32)
     part = np.empty(_ALL, np.int32)
-    plain, lamp, found, air = is_plain(light), light.lamps[0], np.ones(4, np.float32), light.haze[1]
-    found[2] = _ZERO
+    plain, lamp, result, air = is_plain(light), light.lamps[0], np.ones(4, np.float32), light.haze[1]
+    result[2] = _ZERO
     span, veil = depths_seen(nearest), np.exp(-light.haze[0])  # of what is farthest, and of the background
     for i in range(np.uint32(len(background))):
         for j in range(np.uint32(len(background))):
@@ -279,13 +279,13 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
                     cosine = _blend(more, 6, a, b, c, wa, wb, wc)
                     for n in range(3):
                         colour[s, n] = _blend(more, 3 + n, a, b, c, wa, wb, wc)
-                found[0] = light.ambient + lamp[0] * max(_ZERO, cosine)
+                result[0] = light.ambient + lamp[0] * max(_ZERO, cosine)
                 if not plain:
                     u = np.float32(j + (s % SAMPLES - 1) / SAMPLES)
                     v = np.float32(i + (s // SAMPLES - 1) / SAMPLES)
                     place = u, v, _ONE / _blend(places, 2, a, b, c, wa, wb, wc), focal_px, len(background)
-                    light_at(light, place, (x * scale, y * scale, z * scale), span, found)
-                lit, shine, passed, veiled = found[0], found[2], found[3], air * (_ONE - found[3])
+                    light_at(light, place, (x * scale, y * scale, z * scale), span, result)
+                lit, shine, passed, veiled = result[0], result[2], result[3], air * (_ONE - result[3])
                 red += min((colour[s, 0] * lit + shine) * passed + veiled, _ONE)
                 green += min((colour[s, 1] * lit + shine) * passed + veiled, _ONE)
                 blue += min((colour[s, 2] * lit + shine) * passed + veiled, _ONE)
@@ -298,7 +298,7 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
                     out.normal[i, j, 2] = z * scale
                     _store(out.albedo, i, j, colour[s])
                     if len(out.effects):
-                        out.effects[:, i, j] = found
+                        out.effects[:, i, j] = result
             _store(out.image, i, j, (red * share, green * share, blue * share))
 
 

@@ -112,8 +112,8 @@ class DisentanglementCard:
 
     def mean(self, path: str, row: str = MODEL) -> Any:
         """Mean over seeds of a score or matrix by its path in ``FeatureScores``; None if it is missing."""
-        found = [scores.get(path) for scores in self.rows[row]]
-        return None if found[0] is None else np.mean(found, axis=0)
+        results = [scores.get(path) for scores in self.rows[row]]
+        return None if results[0] is None else np.mean(results, axis=0)
 
     def numbers(self) -> dict[str, Any]:
         """Every score of every row and seed for JSON; no matrix of all dimensions, no resamples."""
@@ -135,16 +135,16 @@ class DisentanglementCard:
             f"Disentanglement: {', '.join(self.features)} of {self.n_pictures:,} images, mean over "
             f"{seeds} of all pairs; low correlation alone proves nothing, read it with the swap test"
         )
-        found = [self._means(caption, _SUMMARY), *self._swap_tables()]
+        results = [self._means(caption, _SUMMARY), *self._swap_tables()]
         if truth is None:
-            return found
+            return results
         caption = (
             f"Whole features against {len(truth.factors)} true factors, best 1, mean over {seeds}; "
             "where I is near 0, D and C are accidents"
         )
-        found.append(self._means(caption, _WHOLE))
+        results.append(self._means(caption, _WHOLE))
         if truth.by_dimension is not None:
-            found.append(self._means(f"Single dimensions, as published, mean over {seeds}", _DIMENSIONS))
+            results.append(self._means(f"Single dimensions, as published, mean over {seeds}", _DIMENSIONS))
         together = {name: f"all, {name.split()[0]}" for name in self.rows} | {MODEL: "all"}
         cells = [
             *self.mean("truth.score"),
@@ -154,7 +154,7 @@ class DisentanglementCard:
         caption = "True factors from features, held out: R2 of light and camera, accuracy of classes; best 1"
         columns = [Column(head, None, 2) for head in (*self.features, *together.values(), "chance")]
         rows = [Row(*row) for row in zip(truth.factors, np.stack(cells, axis=1).tolist(), strict=True)]
-        return [*found, ScoreTable(caption, "true factor", columns, rows)]
+        return [*results, ScoreTable(caption, "true factor", columns, rows)]
 
     def _means(self, caption: str, columns: Mapping[str, Column]) -> ScoreTable:
         """A row of means for each set of features; with several seeds, standard deviations below."""
@@ -237,9 +237,9 @@ def disentangle(
 
     @cache
     def features() -> dict[str, np.ndarray]:
-        found = embed_images(model, pixels, batch_size=batch_size)
-        check_finite(found, images.files)
-        return found
+        result = embed_images(model, pixels, batch_size=batch_size)
+        check_finite(result, images.files)
+        return result
 
     sizes = {name: values.shape[1] for name, values in embed_images(model, pixels[:1]).items()}
     correlations = kept.recall_one("card-correlation", inputs, lambda: correlation_matrix(features()))
@@ -271,9 +271,9 @@ def disentangle(
     names = (MODEL, "untrained encoder", "shuffled rows", "random pixels", "PCA")
     rows: dict[str, list[FeatureScores]] = {name: [] for name in names}
     for seed in seeds:
-        for name, found in rows.items():
+        for name, result in rows.items():
             keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_images}
-            found.append(
+            result.append(
                 kept.recall_value("card", {**inputs, **keys}, FeatureScores, partial(made, name, seed))
             )
             if progress is not None:

@@ -133,8 +133,8 @@ def ground_truth_scores(
     """
     blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
-    found = (_predicted(x, factors, seed) for x in (*blocks.values(), everything))
-    score, gain, bins = map(np.stack, zip(*found, strict=True))
+    result = (_predicted(x, factors, seed) for x in (*blocks.values(), everything))
+    score, gain, bins = map(np.stack, zip(*result, strict=True))
     share, informativeness = gain[:-1], float(gain[-1].mean())
     mig = float(np.mean([_information_gap(bins[:-1, k].T, factor) for k, factor in enumerate(factors)]))
     owned = [k for k, factor in enumerate(factors) if set(factor.belongs_to) & set(names)]
@@ -176,15 +176,15 @@ def importance(codes: np.ndarray, factors: Sequence[TrueFactor], method: str, *,
     deviation = codes.std(axis=0)
     alive = deviation > 1e-9 * np.abs(codes).max(axis=0, initial=0)
     standard = (codes[:, alive] - codes[:, alive].mean(axis=0)) / deviation[alive]
-    found = np.zeros((codes.shape[1], len(factors)))
+    result = np.zeros((codes.shape[1], len(factors)))
     for column, factor in enumerate(factors if alive.any() else []):
         if method == "lasso":
             weights = _lasso(standard, factor)
         else:
             kind = GradientBoostingClassifier if factor.is_class else GradientBoostingRegressor
             weights = np.asarray(kind(random_state=seed).fit(standard, factor.values).feature_importances_)
-        found[alive, column] = weights / (weights.sum() or 1)
-    return found
+        result[alive, column] = weights / (weights.sum() or 1)
+    return result
 
 
 def dci(weights: np.ndarray) -> tuple[float, float]:
@@ -238,7 +238,7 @@ def _predicted(x: np.ndarray, factors: Sequence[TrueFactor], seed: int) -> Itera
     every = np.concatenate([factor.targets for factor in factors], axis=1)
     ends = np.cumsum([factor.targets.shape[1] for factor in factors])[:-1]
     answers = np.split(held_out(x, every, seed=seed), ends, axis=2)
-    found = []
+    results = []
     for factor, (answer, constant) in zip(factors, answers, strict=True):
         if factor.is_class:
             bins, largest = answer.argmax(axis=1), factor.largest_share
@@ -247,8 +247,8 @@ def _predicted(x: np.ndarray, factors: Sequence[TrueFactor], seed: int) -> Itera
             bins, largest = binned(answer)[:, 0], 0.0
             left, total = (np.square(each - factor.targets).sum() for each in (answer, constant))
             score = float(1 - left / total)
-        found.append((score, max(0.0, (score - largest) / (1 - largest)), bins))
-    return zip(*found, strict=True)
+        results.append((score, max(0.0, (score - largest) / (1 - largest)), bins))
+    return zip(*results, strict=True)
 
 
 def _lasso(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:

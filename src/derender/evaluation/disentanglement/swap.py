@@ -65,8 +65,8 @@ def encodings(
             rows = slice(start, start + batch_size)
             pixels = as_float(images[rows]).to(model.device)
             if scenes is not None:
-                found = model.render(scenes[rows].to(model.device))
-                pixels = fill_uncovered(found.image.float(), found.mask.float(), pixels)
+                result = model.render(scenes[rows].to(model.device))
+                pixels = fill_uncovered(result.image.float(), result.mask.float(), pixels)
             activations = model.activations(pixels)
             features, decoded = model.features_from(activations), model.decode(model.codes(activations))
             part = {f"parameter {name}": each for name, each in decoded.parameters.items()}

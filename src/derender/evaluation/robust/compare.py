@@ -154,16 +154,16 @@ def robustness(
     learned_from = np.unique(np.concatenate([curve.learn for curve in trial.curves]))
     fit_on = trial.pictures.select(learned_from)
     rows += control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
-    found = compare_robustness(
+    result = compare_robustness(
         {row.name: row.arrays() for row in rows}, trial, how.seeds(seeds),
         controls=[row.name for row in rows if row.control], head=head, resample_count=how.resamples,
         seed=how.seed, memory=how.memory, progress=how.stage("probing", "probes"),
     )  # fmt: skip
     notes = [*how.notes, f"{len(trial.images):,} images: {trial.how}"]
-    notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA)}" for curve in found.curves]
+    notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA)}" for curve in result.curves]
     address = images.source if isinstance(images, ImageSet) else images
-    values = {"pictures": way, "data": None if address is None else str(address), **found.numbers()}
-    return Scores(found.tables(score), values, [*notes, how.memory.summary()], result=found)
+    values = {"pictures": way, "data": None if address is None else str(address), **result.numbers()}
+    return Scores(result.tables(score), values, [*notes, how.memory.summary()], result=result)
 
 
 @dataclass(frozen=True)
@@ -322,10 +322,10 @@ def _scored(
         area = area_under(curve.levels, np.stack(levels, axis=-1))
         return np.stack((ordinary, area, *levels), axis=1)
 
-    found: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
+    result: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
     for name, runs in answers.items():
         both = np.stack([scores(run) for run in runs])
         plain, resampled = both[:, 0], both[:, 1:].mean(axis=0)
-        for at, rows in enumerate(found.values()):
+        for at, rows in enumerate(result.values()):
             rows.append(scored_row(name, name in controls, names, plain[..., at], resampled[..., at]))
-    return {score: with_verdicts(rows) for score, rows in found.items()}
+    return {score: with_verdicts(rows) for score, rows in result.items()}

@@ -107,23 +107,23 @@ def generated_trial(
     }  # fmt: skip
 
     def make() -> dict[str, np.ndarray]:
-        images, found, asked = [], {}, all_angles(axes, levels)
+        images, result, asked = [], {}, all_angles(axes, levels)
         for part in ("learned", "tested"):
             made = recipe.generate(part)
             images.append(made.images)
-            found[part] = {"identity": made.identity, **made.labels}[recipe.label]
-            found[f"who_{part}"] = made.identity
+            result[part] = {"identity": made.identity, **made.labels}[recipe.label]
+            result[f"who_{part}"] = made.identity
         total = sum(map(len, images)) + len(asked) * len(images[1])
         for axis, angle in asked:
             images.append(recipe.generate("tested", axis=axis, angle=angle).images)
             if progress is not None:
                 progress(sum(map(len, images)), total)
-        return {"images": np.concatenate(images), **found}
+        return {"images": np.concatenate(images), **result}
 
-    found = (memory or Memory()).recall("generated", inputs, make)
-    n_learn, values = len(found["learned"]), np.concatenate((found["learned"], found["tested"]))
+    result = (memory or Memory()).recall("generated", inputs, make)
+    n_learn, values = len(result["learned"]), np.concatenate((result["learned"], result["tested"]))
     if values.dtype.kind == "f":
-        values = np.where(values > np.median(found["learned"]), "above", "below")
+        values = np.where(values > np.median(result["learned"]), "above", "below")
     else:  # a class with fewer than two training images is not asked
         names, counts = np.unique(values[:n_learn].astype(str), return_counts=True)
         values = np.where(np.isin(values.astype(str), names[counts > 1]), values.astype(str), "")
@@ -134,11 +134,11 @@ def generated_trial(
         )
     unit = np.arange(len(values))
     if recipe.label != "identity":
-        people = np.concatenate((found["who_learned"], found["who_tested"]))
+        people = np.concatenate((result["who_learned"], result["who_tested"]))
         unit = np.unique(people, return_inverse=True)[1]
     how, dropped = f"{recipe.label} of generated {recipe.kind}", int(missing(values).sum())
     task = task_of({recipe.label: values})
-    return stacked_trial(found["images"], task, unit, n_learn, axes, levels, how, dropped)
+    return stacked_trial(result["images"], task, unit, n_learn, axes, levels, how, dropped)
 
 
 def rendered_trial(
@@ -167,12 +167,12 @@ def rendered_trial(
 
     def rendered(rows: np.ndarray, angles: Sequence[tuple[Axis, float] | None]) -> list[np.ndarray]:
         def render(batch: torch.Tensor) -> list[np.ndarray]:
-            scene, found = model.decompose(batch), []
+            scene, result = model.decompose(batch), []
             for one in angles:
                 rendering = model.render(scene if one is None else one[0].rotated(scene, one[1]))
                 image = fill_uncovered(rendering.image.float(), rendering.mask.float(), batch)
-                found.append((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
-            return found
+                result.append((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+            return result
 
         parts = map_batches(render, model, pictures.images[rows], batch_size=64, progress=progress)
         return [np.concatenate(part) for part in zip(*parts, strict=True)]

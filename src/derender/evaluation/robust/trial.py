@@ -43,8 +43,8 @@ class Axis:
 
     def fixed(self, kind: str, angle_deg: float) -> dict[str, tuple[float, float]]:
         """Ranges of a generator's settings that hold the angle fixed."""
-        found = {self.settings[kind]: (angle_deg, angle_deg)}
-        return found if self.held is None else {**found, self.held: (0.0, 0.0)}
+        result = {self.settings[kind]: (angle_deg, angle_deg)}
+        return result if self.held is None else {**result, self.held: (0.0, 0.0)}
 
     def rotated(self, scene: Scene, angle_deg: float) -> Scene:
         """The scenes at this angle instead of their own; sign as in docs/reference/conventions.md."""
@@ -100,16 +100,16 @@ def chosen_axes(names: Sequence[str], kind: str | None = None) -> tuple[Axis, ..
 
 def checked_levels(levels: Sequence[float], axes: Sequence[Axis]) -> tuple[float, ...]:
     """Angles in degrees, checked against the largest of every axis."""
-    most, found = min(axis.most_deg for axis in axes), tuple(map(float, levels))
-    words = ", ".join(f"{level:g}" for level in found) or "none"
-    if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
+    most, result = min(axis.most_deg for axis in axes), tuple(map(float, levels))
+    words = ", ".join(f"{level:g}" for level in result) or "none"
+    if len(result) < 2 or any(b <= a for a, b in pairwise(result)):
         raise ValueError(f"angles must be two or more that grow, such as 0,30,60; got {words}")
-    if found[0] < 0 or found[-1] > most:
+    if result[0] < 0 or result[-1] > most:
         raise ValueError(
             f"angles must lie within 0..{most:g} degrees for {', '.join(axis.name for axis in axes)}, "
             f"got {words}"
         )
-    return found
+    return result
 
 
 def either_side(level: float) -> tuple[float, ...]:

@@ -195,10 +195,10 @@ def segment(
     weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every image once
 
     def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
-        found = np.stack([resampled_scores(run["counts"], weights) for run in runs])
+        result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
         iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
         losses = np.array([run["losses"] for run in runs if trainable])
-        scored = scored_row(title, control, tuple(COLUMNS), found[:, 0], found[:, 1:].mean(axis=0))
+        scored = scored_row(title, control, tuple(COLUMNS), result[:, 0], result[:, 1:].mean(axis=0))
         return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
     rows = []
@@ -225,8 +225,8 @@ def segment(
         rows.append(row(title, True, runs, 0))
     judged = zip(rows, with_verdicts([row.scored for row in rows]), strict=True)
     compared = tuple(replace(row, scored=scored) for row, scored in judged)
-    found = SegmentationComparison(compared, data, tuple(seeds), settings, shown)
-    return Scores(found.tables(), {"data": data.source, **found.numbers()}, notes, result=found)
+    result = SegmentationComparison(compared, data, tuple(seeds), settings, shown)
+    return Scores(result.tables(), {"data": data.source, **result.numbers()}, notes, result=result)
 
 
 def count_pixels(answers: np.ndarray, masks: np.ndarray, n_classes: int) -> np.ndarray:

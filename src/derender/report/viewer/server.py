@@ -102,9 +102,9 @@ def allowed_host(header: str, bound: str) -> bool:
     A server on a loopback address answers to loopback names only. Elsewhere it also answers to its own and
     the machine's name, and to any numeric address (no foreign name server can hand one out).
     """
-    if (found := HOST.fullmatch(header)) is None:
+    if (match := HOST.fullmatch(header)) is None:
         return False
-    name = (found[1] or found[2]).lower().rstrip(".")
+    name = (match[1] or match[2]).lower().rstrip(".")
     if name == "localhost":
         return True
     address = _address(name)
