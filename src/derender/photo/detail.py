@@ -44,10 +44,8 @@ COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carri
 RIM_SHARE = 0.04  # of the side: the rim of the model's maps, where depth ends in a wall
 REACH_SHARE = 1 / 4  # of the side: how far the surface goes on around them, at least
 FADE_SHARE = 1 / 3  # reach of new shading around them
-SURE, LIKELY = (
-    0.65,
-    (0.8, 0.6),
-)  # half sides: radius that is the object; radius, column where it starts to grow
+SURE = 0.65  # of half the side: radius within which all is the object
+LIKELY = (0.80, 0.60)  # of half the side: radius, and column, in which the search for its outline starts
 DARKEST = 1e-3
 LAMBERT = Renderer("lambert")
 
