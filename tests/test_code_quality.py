@@ -15,12 +15,14 @@ def complaints(*command: str) -> str:
 
 
 def test_ruff_finds_nothing():
-    assert not (found := complaints("ruff", "check", "--quiet", "--output-format=concise", ".")), found
+    assert not (result := complaints("ruff", "check", "--quiet", "--output-format=concise", ".")), result
 
 
 def test_code_is_formatted():
-    assert not (found := complaints("ruff", "format", "--quiet", "--diff", ".")), f"run: make format\n{found}"
+    assert not (result := complaints("ruff", "format", "--quiet", "--diff", ".")), (
+        f"run: make format\n{result}"
+    )
 
 
 def test_pyright_finds_nothing():
-    assert not (found := complaints("pyright", "--pythonpath", sys.executable)), found
+    assert not (result := complaints("pyright", "--pythonpath", sys.executable)), result

@@ -134,12 +134,12 @@ def messages(path: Path) -> list[str]:
     if path.suffix == ".py":
         tree = ast.parse(text)
         unsaid = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-        found: list[str] = []
+        result: list[str] = []
         for node in ast.walk(tree):
             if id(node) not in unsaid and isinstance(node, (ast.JoinedStr, ast.BinOp, ast.Constant)):
                 unsaid.update(map(id, ast.walk(node)))
-                found.append(said(node))
-        return found
+                result.append(message(node))
+        return result
     if path.suffix == ".js":
         return re.findall(r"[\"`]((?:[^\"`\n])*)[\"`]", text)
     text = re.sub(r"<(?:style|script|pre)\b.*?</(?:style|script|pre)>", "", text, flags=re.DOTALL)
@@ -148,12 +148,12 @@ def messages(path: Path) -> list[str]:
     return [*quoted, *re.split(r"</?(?!b>|/?strong|/?code|/?em|/?a\b|span)[^>]*>|\n\s*\n", plain)]
 
 
-def said(node: ast.AST) -> str:
+def message(node: ast.AST) -> str:
     """The text of a string, with X for each value in it."""
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, str) else "X"
     parts = [node.left, node.right] if isinstance(node, ast.BinOp) else getattr(node, "values", ())
-    return "".join(map(said, parts)) if parts else "X"
+    return "".join(map(message, parts)) if parts else "X"
 
 
 def docstrings(path: Path) -> Iterator[str]:
@@ -167,20 +167,20 @@ def docstrings(path: Path) -> Iterator[str]:
 @pytest.mark.parametrize("path", sorted((ROOT / "src/derender").iterdir()), ids=named)
 def test_messages_and_docstrings_of_the_program_are_plain(path):
     """Errors, notices, help, pages of reports and of the viewer; and what the code says of itself."""
-    found = path.rglob("*") if path.is_dir() else [path]
-    files = [one for one in found if one.suffix in (".py", ".html", ".js")]
-    found = [(file, one) for file in files for text in messages(file) for one in unclear(text)]
+    result = path.rglob("*") if path.is_dir() else [path]
+    files = [one for one in result if one.suffix in (".py", ".html", ".js")]
+    result = [(file, one) for file in files for text in messages(file) for one in unclear(text)]
     for file in files:
         texts = docstrings(file) if file.suffix == ".py" else ()
-        found += [(file, one) for text in texts for one in sentences(text) if too_hard(one)]
-    assert not found, "\n".join(f"{named(file)}: {one}" for file, one in found)
+        result += [(file, one) for text in texts for one in sentences(text) if too_hard(one)]
+    assert not result, "\n".join(f"{named(file)}: {one}" for file, one in result)
 
 
 def unclear(text: str) -> list[str]:
     """Sentences of a text that are too long or hold a banned word."""
     text = re.sub(r"[\w/]+(?:\.\w+)+", "code", text)
-    found = sentences(text) if " " in text and "{" not in text and "#version" not in text else []
-    return [one for one in found if too_hard(one)]
+    result = sentences(text) if " " in text and "{" not in text and "#version" not in text else []
+    return [one for one in result if too_hard(one)]
 
 
 def too_hard(sentence: str) -> bool:

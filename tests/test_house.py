@@ -36,7 +36,7 @@ BUDGET = {  # lines, files
     "learn": (1_210, 6),
 }
 TOTAL = (40_280, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_820
+TEST_LINES = 25_840
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}
@@ -55,22 +55,22 @@ def length(path: Path) -> int:
 
 def sizes() -> dict[str, tuple[int, int]]:
     """Lines and files of every package; single modules at the top are counted as one, "(top)"."""
-    found: dict[str, list[int]] = defaultdict(list)
+    result: dict[str, list[int]] = defaultdict(list)
     for path in SOURCES:
         parts = path.relative_to(PACKAGE).parts
-        found[parts[0] if len(parts) > 1 else "(top)"].append(length(path))
-    return {name: (sum(lines), len(lines)) for name, lines in found.items()}
+        result[parts[0] if len(parts) > 1 else "(top)"].append(length(path))
+    return {name: (sum(lines), len(lines)) for name, lines in result.items()}
 
 
 def test_every_package_keeps_to_its_budget():
-    found = sizes()
+    result = sizes()
     shown = "\n".join(
         f"{name:<16}{lines:>7,} lines {files:>4} files   budget {BUDGET.get(name)}"
-        for name, (lines, files) in sorted(found.items(), key=lambda row: -row[1][0])
+        for name, (lines, files) in sorted(result.items(), key=lambda row: -row[1][0])
     )
-    over = [name for name, most in BUDGET.items() if found[name][0] > most[0] or found[name][1] > most[1]]
+    over = [name for name, most in BUDGET.items() if result[name][0] > most[0] or result[name][1] > most[1]]
     assert not over, f"over budget: {over}\n{shown}"
-    total = tuple(map(sum, zip(*found.values(), strict=True)))
+    total = tuple(map(sum, zip(*result.values(), strict=True)))
     assert total[0] <= TOTAL[0] and total[1] <= TOTAL[1], f"{total} of {TOTAL}\n{shown}"
 
 
@@ -117,25 +117,25 @@ def test_no_variable_has_a_private_name():
 def public_texts(path: Path) -> list[str]:
     """Docstrings of a module and of what is public in it, and help texts of options."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    found = [ast.get_docstring(tree) or ""]
+    results = [ast.get_docstring(tree) or ""]
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
-            found.append(ast.get_docstring(node) or "")
+            results.append(ast.get_docstring(node) or "")
         helps = isinstance(node, ast.keyword) and node.arg == "help"
         if (helps or isinstance(node, ast.Assign)) and isinstance(node.value, ast.Constant):
-            found.append(str(node.value.value))  # of options, some named before
-    return found
+            results.append(str(node.value.value))  # of options, some named before
+    return results
 
 
 def test_public_texts_use_the_words_of_the_field():
     """docs/glossary.md has the words that take the place of these."""
-    found = [
+    results = [
         f"{path.relative_to(PACKAGE)}: {match[0]}"
         for path in SOURCES
         for text in public_texts(path)
         for match in BANNED.finditer(text)
     ]
-    assert not found, "\n".join(found)
+    assert not results, "\n".join(results)
 
 
 def test_help_texts_are_whole_phrases():

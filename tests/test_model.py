@@ -56,13 +56,13 @@ def test_render_of_decompose_is_reconstruct(model, images):
 
 
 def test_activations_begin_with_the_code_and_end_with_the_spatial_map(model, images):
-    found = model.activations(images)
+    result = model.activations(images)
     codes = model.encode(images)
-    for name, code in model.codes(found).items():
+    for name, code in model.codes(result).items():
         torch.testing.assert_close(code, codes[name])
-        torch.testing.assert_close(model.features_from(found)[name], codes[name])  # nothing was fitted yet
+        torch.testing.assert_close(model.features_from(result)[name], codes[name])  # nothing was fitted yet
         places = model.nets[name].encoder.spatial(images)
-        torch.testing.assert_close(found[name][:, code.shape[1] :], places.flatten(1))
+        torch.testing.assert_close(result[name][:, code.shape[1] :], places.flatten(1))
 
 
 def test_features_are_exchanged_in_a_model_that_shares_the_weights(model, images):
@@ -85,9 +85,9 @@ def test_nothing_but_with_features_sets_the_parts_of_features():
 
 def test_many_channels_are_averaged_over_places():
     places = torch.arange(2 * 300 * 16.0).reshape(2, 300, 4, 4)
-    found = activations(torch.zeros(2, 5), places)
-    assert found.shape == (2, 5 + 300 * 4)
-    assert found[0, 5] == places[0, 0, :2, :2].mean()
+    result = activations(torch.zeros(2, 5), places)
+    assert result.shape == (2, 5 + 300 * 4)
+    assert result[0, 5] == places[0, 0, :2, :2].mean()
     assert activations(torch.zeros(2, 5), places[:, :128]).shape == (2, 5 + 128 * 16)
 
 
@@ -232,8 +232,8 @@ def test_every_bundled_model_loads_by_name_and_has_a_card(generator):
         assert not model.training
         assert all(value.dtype == torch.float32 for value in model.parameters())
         size = model.image_size
-        found = model.reconstruct(torch.rand(2, 3, size, size, generator=generator))
-        assert found.image.isfinite().all()
+        result = model.reconstruct(torch.rand(2, 3, size, size, generator=generator))
+        assert result.image.isfinite().all()
         card = (PRETRAINED / name / "README.md").read_text()
         assert "**Trained on**" in card
         assert "**Known failures.**" in card
@@ -242,6 +242,6 @@ def test_every_bundled_model_loads_by_name_and_has_a_card(generator):
 
 def test_the_bundled_face_model_has_the_geometry_its_card_says(shared_data):
     truth = read_ground_truth(shared_data("data/synface64.zip"), limit=100)
-    found = evaluate_geometry(derender.load("rendered-faces-64"), truth)
-    assert found.model.side < 0.009
-    assert found.model.mad_deg < 13
+    result = evaluate_geometry(derender.load("rendered-faces-64"), truth)
+    assert result.model.side < 0.009
+    assert result.model.mad_deg < 13

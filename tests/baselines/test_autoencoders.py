@@ -63,20 +63,20 @@ def test_every_place_gets_the_nearest_entry_and_gradients_go_their_two_ways(seed
     losses(model, IMAGES, ae.VqvaeConfig())  # k-means starts the codebook
     model.eval()
     grid = torch.randn(2, 8, 5, 5, requires_grad=True)
-    through, found, indices = model.quantise(grid)
+    through, result, indices = model.quantise(grid)
     entries, flat = model.codebook.codebook, grid.detach().permute(0, 2, 3, 1).reshape(-1, 8)
     assert torch.equal(indices.flatten(), torch.cdist(flat, entries.detach()).argmin(dim=1))
-    torch.testing.assert_close(through, found)
-    torch.testing.assert_close(found[1, :, 2, 3], entries[indices[1, 2, 3]])
+    torch.testing.assert_close(through, result)
+    torch.testing.assert_close(result[1, :, 2, 3], entries[indices[1, 2, 3]])
 
     model.train()
-    through, found, indices = model.quantise(grid)
+    through, result, indices = model.quantise(grid)
     cotangent, stored = torch.randn(2, 8, 5, 5), model.codebook._codebook.embed
     kept = {"allow_unused": True, "retain_graph": True}
     to_grid, to_codebook = torch.autograd.grad((through * cotangent).sum(), [grid, stored], **kept)
     torch.testing.assert_close(to_grid, cotangent)
     assert to_codebook is None or not to_codebook.any()
-    (to_codebook,) = torch.autograd.grad((found * cotangent).sum(), [stored])
+    (to_codebook,) = torch.autograd.grad((result * cotangent).sum(), [stored])
     rows = cotangent.permute(0, 2, 3, 1).reshape(-1, 8)
     torch.testing.assert_close(to_codebook[0], torch.zeros(16, 8).index_add_(0, indices.flatten(), rows))
 

@@ -36,8 +36,8 @@ def test_the_codes_are_the_first_and_what_is_added(model, images):
     for layer, changed in ((model.encoder.to_fine, [7]), (model.encoder.to_middle, [3, 4, 5, 6, 7])):
         with torch.no_grad():
             layer.bias.add_(1)
-        found = model.invert(images)
-        assert [code for code in range(8) if not torch.equal(found[:, code], whole[:, code])] == changed
+        result = model.invert(images)
+        assert [code for code in range(8) if not torch.equal(result[:, code], whole[:, code])] == changed
 
 
 def test_the_mean_code_is_added(model, images):

@@ -84,8 +84,8 @@ def scipy_upfirdn(image, taps, up, padding):
 def test_upfirdn_is_scipys(up, padding, generator):
     taps = torch.tensor([0.1, 0.5, -0.2, 0.4, 0.3], dtype=torch.float64)  # not symmetric
     images = torch.randn(2, 3, 7, 10, dtype=torch.float64, generator=generator)
-    found = gan.upfirdn(images, taps, up=up, padding=padding)
-    for one, image in zip(found.flatten(0, 1), images.flatten(0, 1), strict=True):
+    result = gan.upfirdn(images, taps, up=up, padding=padding)
+    for one, image in zip(result.flatten(0, 1), images.flatten(0, 1), strict=True):
         wanted = scipy_upfirdn(image.numpy(), taps.numpy(), up, padding)
         torch.testing.assert_close(one, torch.from_numpy(wanted))
 
@@ -100,8 +100,8 @@ def by_one_kernel_an_image(images, weight, style, demodulate, up):
     flat = images.reshape(1, -1, *images.shape[2:])
     if up:
         kernels = own.transpose(1, 2).reshape(n * inputs, outputs, kernel, kernel)
-        found = conv_transpose2d(flat, kernels, stride=2, groups=n)
-        return gan.upfirdn(found.reshape(n, outputs, *found.shape[2:]), 2 * TAPS, padding=(1, 1))
+        result = conv_transpose2d(flat, kernels, stride=2, groups=n)
+        return gan.upfirdn(result.reshape(n, outputs, *result.shape[2:]), 2 * TAPS, padding=(1, 1))
     kernels = own.reshape(n * outputs, inputs, kernel, kernel)
     return conv2d(flat, kernels, padding=kernel // 2, groups=n).reshape(n, outputs, *images.shape[2:])
 
@@ -112,10 +112,10 @@ def test_modulation_is_that_of_one_kernel_for_each_image(demodulate, up, generat
     conv = gan.ModulatedConv(4, 7, 3, 8, demodulate=demodulate, up=up).double()
     draw = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in ((3, 4, 5, 6), (3, 4))]
     inputs = (*(value.requires_grad_() for value in draw), conv.weight)
-    found, wanted = conv(*draw), by_one_kernel_an_image(draw[0], conv.weight, draw[1], demodulate, up)
-    torch.testing.assert_close(found, wanted)
-    cotangent = torch.randn(found.shape, dtype=torch.float64, generator=generator)
-    gradients = (torch.autograd.grad(made, inputs, cotangent) for made in (found, wanted))
+    result, wanted = conv(*draw), by_one_kernel_an_image(draw[0], conv.weight, draw[1], demodulate, up)
+    torch.testing.assert_close(result, wanted)
+    cotangent = torch.randn(result.shape, dtype=torch.float64, generator=generator)
+    gradients = (torch.autograd.grad(made, inputs, cotangent) for made in (result, wanted))
     for ours, theirs in zip(*gradients, strict=True):
         torch.testing.assert_close(ours, theirs)
 

@@ -61,8 +61,8 @@ def test_spherical_kmeans_finds_directions_whatever_their_length(generator):
     rows = (directions[truth] + 0.05 * torch.rand(300, 5, generator=generator)) * lengths
     centres = ris.spherical_kmeans(rows, 3, generator)
     torch.testing.assert_close(centres.norm(dim=1), torch.ones(3))
-    found = (rows @ centres.T).argmax(dim=1)
-    assert len(set(zip(truth.tolist(), found.tolist(), strict=True))) == 3
+    result = (rows @ centres.T).argmax(dim=1)
+    assert len(set(zip(truth.tolist(), result.tolist(), strict=True))) == 3
     with pytest.raises(ValueError, match="4 clusters need at least as many places, got 3"):
         ris.spherical_kmeans(rows[:3], 4, generator)
 
@@ -74,8 +74,8 @@ def test_small_parts_get_the_cluster_where_they_gather():
     eye = torch.zeros(10, 100)
     eye[9, :60] = 1
     eye[0, :5] = 1
-    found = ris.name_clusters(clusters, 3, torch.stack([1 - eye, eye])[None])
-    assert found.tolist() == [0, 1, 0]  # cluster 2 was never seen: the largest part
+    result = ris.name_clusters(clusters, 3, torch.stack([1 - eye, eye])[None])
+    assert result.tolist() == [0, 1, 0]  # cluster 2 was never seen: the largest part
 
 
 def test_scores_are_mean_energy_over_a_part(generator):
@@ -159,11 +159,11 @@ def test_a_catalogue_lies_in_a_folder(catalogue, tmp_path):
     catalogue.save(tmp_path / "ris")
     again = load_baseline(tmp_path / "ris", "ris")
     images = torch.rand(2, 3, 32, 32)
-    found = again.embed(images)
-    assert list(found) == [*PARTS, "pose"]
-    assert {tuple(values.shape) for values in found.values()} == {(2, again.matrix.shape[1])}
+    result = again.embed(images)
+    assert list(result) == [*PARTS, "pose"]
+    assert {tuple(values.shape) for values in result.values()} == {(2, again.matrix.shape[1])}
     for name, values in catalogue.embed(images).items():
-        assert np.array_equal(values.numpy(), found[name].numpy())
+        assert np.array_equal(values.numpy(), result[name].numpy())
     again.choose(("pose",))
     assert list(again.embed(images)) == ["pose"]
     with pytest.raises(ValueError, match=r"unknown feature of ris 'hiar'.*'hair'"):

@@ -40,15 +40,15 @@ def test_each_loss_moves_its_own_network(model, images, generator, losses):
 
 def test_r1_of_a_linear_score_is_half_its_squared_slope(generator):
     score = nn.Sequential(nn.Flatten(), nn.Linear(12, 1), nn.Flatten(0))
-    found = stylegan2.r1_penalty(score, torch.rand(5, 3, 2, 2, generator=generator))
-    torch.testing.assert_close(found, score[1].weight.square().sum() / 2)
+    result = stylegan2.r1_penalty(score, torch.rand(5, 3, 2, 2, generator=generator))
+    torch.testing.assert_close(result, score[1].weight.square().sum() / 2)
 
 
 def test_path_lengths_are_those_of_the_jacobian(model, generator):
     """One column for each number of W+, by central differences of the images."""
     net, w = model.learner.double(), torch.randn(2, TINY.codes, 6, generator=generator, dtype=torch.float64)
     state = generator.get_state()
-    found = stylegan2.path_lengths(net, w, generator)
+    result = stylegan2.path_lengths(net, w, generator)
     generator.set_state(state)
     noise = net.random_noise(2, generator)
     direction = torch.randn(2, 3, 8, 8, generator=generator).double() / 8
@@ -60,7 +60,7 @@ def test_path_lengths_are_those_of_the_jacobian(model, generator):
             after, before = (net(w[one] + sign * steps, here) for sign in (1, -1))
             pulled = ((after - before) / 2e-5 * direction[one]).sum(dim=(1, 2, 3))
             wanted = (pulled.square().sum() / TINY.codes).sqrt()
-            torch.testing.assert_close(found[one].detach(), wanted, rtol=1e-6, atol=0.0)
+            torch.testing.assert_close(result[one].detach(), wanted, rtol=1e-6, atol=0.0)
 
 
 def test_the_average_follows_at_its_half_life(model):

@@ -12,14 +12,14 @@ from derender.speed import SpeedPair, measured, require_agreement
 
 def test_the_quick_bench_reports_every_pair_with_the_machine(tmp_path, capsys):
     assert main(["bench", "--quick", "--json", str(tmp_path / "speed.json")]) == 0
-    found = json.loads((tmp_path / "speed.json").read_text())
-    assert [row["what"].split()[0] for row in found["rows"]] == ["rendering", "embedding", "Ward"]
-    for row in found["rows"]:
+    result = json.loads((tmp_path / "speed.json").read_text())
+    assert [row["what"].split()[0] for row in result["rows"]] == ["rendering", "embedding", "Ward"]
+    for row in result["rows"]:
         assert row["least"] <= row["ratio"] <= row["most"]
         assert row["ours_per_second"] > 0
-    version, _, build = found["machine"]["packages"]["torch"].partition("+")
+    version, _, build = result["machine"]["packages"]["torch"].partition("+")
     assert version == torch.__version__.partition("+")[0] and build in torch.__version__
-    waiting = found["waiting"]
+    waiting = result["waiting"]
     assert 0 < waiting["share"] < 1 and 0 < waiting["share_unaided"] < 1 and waiting["seconds"] > 0
     printed = capsys.readouterr().out
     assert "Ward clustering" in printed and "spent waiting for data" in printed

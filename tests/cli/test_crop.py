@@ -31,12 +31,12 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, numbers):
     both = ("-m", KNOWN, photos / "near.png", photos / "wide.png", "-o")
     whole, printed = numbers("decompose", *both, tmp_path / "whole", "--frame", "none")
     assert "or another crop (derender align, --frame)" in printed
-    found, printed = numbers("decompose", *both, tmp_path / "framed", "--crop", "auto")
+    result, printed = numbers("decompose", *both, tmp_path / "framed", "--crop", "auto")
     assert "shown in part, 70 % of their side: 1 of 2 images" in printed
     assert "1 of 2 images are reconstructed worse than 99 %" in printed  # chosen by that error: no acquittal
-    near, wide = (found["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
+    near, wide = (result["framing"][str(photos / name)] for name in ("near.png", "wide.png"))
     assert (near["side"], near["across"], near["down"], near["found"]) == (1.0, 0.0, 0.0, "auto")
-    assert {one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, found)} == {100}
+    assert {one["reconstruction_percentile"][str(photos / "wide.png")] for one in (whole, result)} == {100}
     shown = np.asarray(Image.open(tmp_path / "framed" / "wide" / "input.png").convert("RGB"), float)
     face = rendered_examples(KNOWN, 64)[3].picture
     assert Crop(wide["side"], wide["across"], wide["down"]) == TRUE

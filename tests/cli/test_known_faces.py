@@ -22,20 +22,20 @@ def folder(tmp_path_factory) -> str:
 
 def test_identification_by_light_of_one_half(tiny, folder, numbers, tmp_path):
     words = ["evaluate", "identify", folder, "-m", tiny, "--half", "test", *EMBEDDED]
-    found, notes = numbers(*words, "--markdown", tmp_path / "table.md")
-    people = found["people"]
-    assert 0 < people < 8 and found["half"] == "test" and "half=test" in notes
-    assert found["probes"] == {"all": 2 * people, "<= 25": people, "<= 77": people}
-    assert found["rows"]["Gradientfaces"]["scores"]["<= 25"]["value"] == 1
+    result, notes = numbers(*words, "--markdown", tmp_path / "table.md")
+    people = result["people"]
+    assert 0 < people < 8 and result["half"] == "test" and "half=test" in notes
+    assert result["probes"] == {"all": 2 * people, "<= 25": people, "<= 77": people}
+    assert result["rows"]["Gradientfaces"]["scores"]["<= 25"]["value"] == 1
     assert "nearest by cosine less the mean of the gallery; test half" in (tmp_path / "table.md").read_text()
     rest, _ = numbers(*[word if word != "test" else "development" for word in words])
-    assert rest["people"] == 8 - people and not set(rest["gallery"]) & set(found["gallery"])
+    assert rest["people"] == 8 - people and not set(rest["gallery"]) & set(result["gallery"])
 
 
 def test_light_against_the_names(tiny, folder, numbers):
-    found, _ = numbers("evaluate", "light", folder, "-m", tiny, *QUICK)
-    rows = found["azimuth"]
-    assert found["pictures"] == 24 and set(rows) == {"model", "untrained model", "constant answer"}
+    result, _ = numbers("evaluate", "light", folder, "-m", tiny, *QUICK)
+    rows = result["azimuth"]
+    assert result["pictures"] == 24 and set(rows) == {"model", "untrained model", "constant answer"}
     assert rows["constant answer"]["scores"]["error"]["value"] == pytest.approx(80 / 3, rel=1e-4)
 
 

@@ -140,9 +140,9 @@ def test_search_with_a_picture_of_the_table(table, tiny, photos, tmp_path, numbe
     assert distances == sorted(distances) and distances[0] > 1e-5
     assert "left out as the very same image: 4.png (--copies" in printed
     answer, printed = numbers(*words, "--copies", "--force")
-    found = answer["found"]
-    assert found[0]["file"] == "4.png" and len(found) == 3 and "4.png" in printed
-    assert found[0]["distance"] == pytest.approx(0, abs=1e-5)
+    result = answer["found"]
+    assert result[0]["file"] == "4.png" and len(result) == 3 and "4.png" in printed
+    assert result[0]["distance"] == pytest.approx(0, abs=1e-5)
     with Image.open(sheet) as drawn:
         assert drawn.width > 4 * 160
 

@@ -19,9 +19,9 @@ def settings(capsys):
 
     def printed(*arguments: str | Path) -> dict:
         code = run("train", "--data", "nowhere", "--out", "nowhere/run", "--dry-run", *arguments)
-        found = capsys.readouterr()
-        assert code == 0, found.err
-        return yaml.safe_load(found.out)
+        result = capsys.readouterr()
+        assert code == 0, result.err
+        return yaml.safe_load(result.out)
 
     return printed
 
@@ -71,11 +71,11 @@ def test_what_is_no_settings_is_one_clear_line(tmp_path, refused, text, more, me
 
 @pytest.mark.parametrize("name", RUNS)
 def test_the_runs_of_the_models_that_come_along_can_be_made_again(settings, name):
-    found = settings("--config", EXAMPLES / f"{name}.yaml")
-    assert found["preset"] == "small"
-    assert found["objective"]["loocc"] == "light+camera"
+    result = settings("--config", EXAMPLES / f"{name}.yaml")
+    assert result["preset"] == "small"
+    assert result["objective"]["loocc"] == "light+camera"
     asked = yaml.safe_load((EXAMPLES / f"{name}.yaml").read_text())
-    assert found["images"] == asked["images"]
+    assert result["images"] == asked["images"]
 
 
 @pytest.mark.parametrize("name", ["loocc", "loocc-late", "paper"])

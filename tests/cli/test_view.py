@@ -31,19 +31,19 @@ def photos(tmp_path_factory):
 @pytest.fixture
 def served(monkeypatch):
     """What would be served; the server itself does not run."""
-    found = []
+    results = []
 
     def instead(application, listener):
-        found.append((application, listener.getsockname()))
+        results.append((application, listener.getsockname()))
         application.close()
 
     monkeypatch.setattr("derender.report.viewer.server.serve", instead)
-    return found
+    return results
 
 
 def test_a_model_that_cannot_fit_scenes_is_told_how_it_could(model, refused):
-    said = refused("view", "--model", model, "--fit-steps", 5)
-    assert "cannot optimise scenes per image yet: derender whiten" in said
+    message = refused("view", "--model", model, "--fit-steps", 5)
+    assert "cannot optimise scenes per image yet: derender whiten" in message
 
 
 def test_it_listens_on_this_machine_only(model, photos, served, tmp_path, capsys):
@@ -105,11 +105,11 @@ def test_it_answers_until_ctrl_c(model, photos, tmp_path):
                 urllib.request.urlopen(foreign, timeout=60)
             answer.value.close()
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=60)
+            _, message = process.communicate(timeout=60)
         finally:
             process.kill()
     assert process.returncode == 0
-    assert said.strip() == "stopped"
+    assert message.strip() == "stopped"
 
 
 def _url(process: subprocess.Popen, told) -> str:

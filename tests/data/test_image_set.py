@@ -131,9 +131,9 @@ def parts(split):
     st.sampled_from([(0.8, 0.1, 0.1), (0.5, 0.25, 0.25), (1, 0, 0), (0, 0, 1), (0.7, 0.3, 0)]),
 )
 def test_every_row_once_in_the_right_numbers(count, fractions):
-    found = parts(split_indices(count, fractions, seed=3))
-    assert sorted(np.concatenate(found).tolist()) == list(range(count))
-    for part, fraction in zip(found, fractions, strict=True):
+    result = parts(split_indices(count, fractions, seed=3))
+    assert sorted(np.concatenate(result).tolist()) == list(range(count))
+    for part, fraction in zip(result, fractions, strict=True):
         assert abs(len(part) - count * fraction) < 1
         assert (np.diff(part) > 0).all()
 

@@ -118,8 +118,8 @@ def as_parquet() -> bytes:
 
 
 def found_in(source, **options):
-    with list_images(source, **options) as found:
-        return found
+    with list_images(source, **options) as result:
+        return result
 
 
 @pytest.mark.parametrize("zipped", [False, True])
@@ -128,10 +128,10 @@ def found_in(source, **options):
 def test_recognised_wherever_the_tree_lies(tree, name, zipped, wrapped):
     """As published, and inside a folder that an archive program added."""
     around = "download/" if wrapped else ""
-    found = found_in(tree({around + file: content for file, content in TREES[name].items()}, zipped))
-    assert found.layout == name
-    for column in found.table.labels.values():
-        assert len(column) == len(found.table.files) > 0
+    result = found_in(tree({around + file: content for file, content in TREES[name].items()}, zipped))
+    assert result.layout == name
+    for column in result.table.labels.values():
+        assert len(column) == len(result.table.files) > 0
 
 
 RADIANS = {"light_pitch_rad": [math.pi / 6, 0], "light_yaw_rad": [-math.pi / 4, 0]}
@@ -333,9 +333,9 @@ def test_faults_of_addresses_archives_and_nested_columns(tree, tmp_path, encoded
     ],
 )
 def test_what_a_column_is(cells, expected):
-    found = label_column(cells)
-    assert found.dtype.kind == expected.dtype.kind and found.itemsize >= expected.itemsize
-    np.testing.assert_array_equal(found, expected)
+    result = label_column(cells)
+    assert result.dtype.kind == expected.dtype.kind and result.itemsize >= expected.itemsize
+    np.testing.assert_array_equal(result, expected)
 
 
 @pytest.mark.parametrize(("name", "content"), [("mine.csv", LISTED), ("mine.PARQUET", as_parquet())])

@@ -261,9 +261,9 @@ def test_official_parts_and_attributes(tree, published):
     attributes = "2\nBald Smiling \n0.jpg  -1  1\n1.jpg   1 -1\n"
     lists = {"CelebA-HQ-to-CelebA-mapping.txt": MAPPING, "CelebAMask-HQ-attribute-anno.txt": attributes}
     source = tree({**published, **third, **lists})
-    found = read_masks(source, 8)
-    assert found.images.partition.tolist() == ["train", "train", "test"]
-    assert found.images.labels["Bald"].tolist() == [0, 1, -1]
+    result = read_masks(source, 8)
+    assert result.images.partition.tolist() == ["train", "train", "test"]
+    assert result.images.labels["Bald"].tolist() == [0, 1, -1]
     assert [file[-5:] for file in read_masks(source, 8, subset="test").images.files] == ["2.jpg"]
     assert len(read_masks(f"{source}::train", 8).masks) == 2
     with pytest.raises(ValueError, match="no part 'validation': its parts are test, train"):

@@ -35,12 +35,12 @@ def with_claims(content: bytes, old: int, new: int) -> list[bytes]:
     """A file for each place in the footer where ``old`` stands as a 64-bit number, and one for all."""
     length = int.from_bytes(content[-8:-4], "little")
     body, pieces = content[: -8 - length], content[-8 - length : -8].split(number(old))
-    found = []
+    results = []
     for changed in [*({place} for place in range(1, len(pieces))), set(range(1, len(pieces)))]:
         rest = ((number(new if at in changed else old) + one) for at, one in enumerate(pieces[1:], 1))
         footer = pieces[0] + b"".join(rest)
-        found.append(body + footer + len(footer).to_bytes(4, "little") + b"PAR1")
-    return found
+        results.append(body + footer + len(footer).to_bytes(4, "little") + b"PAR1")
+    return results
 
 
 def test_features_that_are_all_the_same_are_read(tmp_path):

@@ -126,5 +126,5 @@ def test_of_a_damaged_archive_is_read_what_its_directory_says_or_nothing(content
             sizes = source.stamps(source.files).tolist()
             for file, known in zip(source.files, sizes, strict=True):
                 with contextlib.suppress(ValueError):
-                    found = source.read(file)
-                    assert [len(found), zlib.crc32(found)] == known
+                    result = source.read(file)
+                    assert [len(result), zlib.crc32(result)] == known

@@ -26,17 +26,17 @@ def test_a_resample_draws_as_many_rows_and_portions_do_not_matter(monkeypatch):
 
 def test_the_interval_of_a_share_is_the_known_one():
     right = np.arange(400) < 300
-    found = estimate([0.75], all_weights(400, 4_000) @ right / 400)
+    result = estimate([0.75], all_weights(400, 4_000) @ right / 400)
     error = 1.96 * (0.75 * 0.25 / 400) ** 0.5
-    assert found.low == pytest.approx(0.75 - error, abs=0.004)
-    assert found.high == pytest.approx(0.75 + error, abs=0.004)
-    assert np.isnan(found.deviation)
+    assert result.low == pytest.approx(0.75 - error, abs=0.004)
+    assert result.high == pytest.approx(0.75 + error, abs=0.004)
+    assert np.isnan(result.deviation)
     assert estimate([0.7, 0.8], np.zeros(3)).deviation == pytest.approx(0.1 / 2**0.5)
 
 
 def test_centred_resamples_lie_about_the_value():
-    found = estimate([0.5], np.array([0.6, 0.7, 0.8]), centred=True)
-    assert (found.low + found.high) / 2 == pytest.approx(0.5) and found.low < 0.5 < found.high
+    result = estimate([0.5], np.array([0.6, 0.7, 0.8]), centred=True)
+    assert (result.low + result.high) / 2 == pytest.approx(0.5) and result.low < 0.5 < result.high
     assert estimate([0.95], np.array([0.6, 0.7, 0.8]), centred=True, most=1.0).high == pytest.approx(0.9975)
     assert estimate([0.99], np.array([0.1, 0.7, 0.8, 0.9]), centred=True, most=1.0).high == 1
 
@@ -79,8 +79,8 @@ def test_features_of_equal_worth_are_called_better_by_chance_alone():
 
 
 def test_numbers_carry_no_resamples_which_need_rows():
-    found = row("ours", np.ones(5), all_weights(5, 4)).numbers()
+    result = row("ours", np.ones(5), all_weights(5, 4)).numbers()
     expected = {"value": 1, "low": 1, "high": 1, "spread": float("nan")}
-    assert found["scores"]["accuracy"] == pytest.approx(expected, nan_ok=True)
+    assert result["scores"]["accuracy"] == pytest.approx(expected, nan_ok=True)
     with pytest.raises(ValueError, match="needs a row and a resample, got 0 rows"):
         list(resamples(0))

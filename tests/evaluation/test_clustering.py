@@ -92,10 +92,10 @@ def test_at_least_keeps_big_classes_and_their_first_members():
 
 def test_true_groups_win_and_say_so():
     features, who = problem()
-    found = compare(features, {"who": who})
-    rows = {row.name: row for row in found.rows}
+    result = compare(features, {"who": who})
+    rows = {row.name: row for row in result.rows}
     assert list(rows) == ["ours", "noise", "majority", "chance"]
-    assert [row.control for row in found.rows] == [False, True, True, True]
+    assert [row.control for row in result.rows] == [False, True, True, True]
     ours = rows["ours"]
     assert all(ours.scores[score].value == pytest.approx(1) for score in METRICS)
     assert all(one.above for one in ours.versus.values())
@@ -103,7 +103,7 @@ def test_true_groups_win_and_say_so():
     assert rows["majority"].scores["accuracy"].value == pytest.approx(1 / 3)
     assert rows["majority"].scores["nmi"].value == rows["majority"].scores["ari"].value == 0
     assert abs(rows["chance"].scores["ari"].value) < 0.03
-    assert (found.n_rows, found.n_dropped, found.labels) == (90, 0, {"who": 3})
+    assert (result.n_rows, result.n_dropped, result.labels) == (90, 0, {"who": 3})
 
 
 def test_intervals_hold_the_value_and_shuffled_labels_are_at_chance():
@@ -131,8 +131,8 @@ def test_missing_labels_are_dropped_and_counted():
     features, who = problem()
     column = who.astype(object)
     column[[0, 1]] = None
-    found = compare(features, {"who": column})
-    assert (found.n_rows, found.n_dropped, found.n_missing) == (88, 2, 0)
+    result = compare(features, {"who": column})
+    assert (result.n_rows, result.n_dropped, result.n_missing) == (88, 2, 0)
     other = np.arange(90) % 2
     both = compare(features, {"who": column, "other": other})
     assert (both.n_rows, both.n_dropped, both.n_missing) == (90, 0, 2)
@@ -160,21 +160,21 @@ def test_tables_show_scores_intervals_and_the_strongest_control():
     features, who = problem()
     column = who.astype(object)
     column[:19] = None
-    found = compare(features, {"who": column})
-    table = clustering_table(found)
+    result = compare(features, {"who": column})
+    table = clustering_table(result)
     assert [one.name for one in table.columns] == ["accuracy", "95 %", "±", "F1", "NMI", "matched", "ARI"]
     assert table.caption == "Ward clustering: 71 rows, 3 classes of who; 19 rows without label left out"
     values = table.values()
     assert np.isnan(values["ours"]["±"]) and values["noise"]["±"] > 0
     assert np.isnan(values["chance"]["95 %"].low)
     assert values["noise"]["95 %"].low < values["noise"]["accuracy"] < values["noise"]["95 %"].high
-    judged = verdict_table(found.rows, CLUSTER_COLUMNS, "above?")
+    judged = verdict_table(result.rows, CLUSTER_COLUMNS, "above?")
     assert [row.name for row in judged.rows] == [f"ours: {c.name}" for c in CLUSTER_COLUMNS.values()]
-    rival = found.rows[0].versus["accuracy"].rival
+    rival = result.rows[0].versus["accuracy"].rival
     assert judged.values()["ours: accuracy"]["strongest control"] == rival
     assert judged.values()["ours: accuracy"]["above"] == "yes"
-    assert f"above the strongest control ({rival})" in verdict(found.rows[0], "accuracy")
-    assert verdict(found.rows[1], "nmi").startswith("noise: 0.")
+    assert f"above the strongest control ({rival})" in verdict(result.rows[0], "accuracy")
+    assert verdict(result.rows[1], "nmi").startswith("noise: 0.")
     same = compare({"ours": features["noise"], "noise": features["noise"]}, {"who": who}).rows[0]
     assert any(word in verdict(same, "ari") for word in ("not distinguished from", "below"))
 
@@ -189,10 +189,10 @@ def test_a_metric_declared_once_is_scored_judged_and_shown(monkeypatch):
         return (table.sum(axis=1) * pure).sum(axis=1) / table.sum(axis=(1, 2))
 
     features, who = problem()
-    found = compare(features, {"who": who})
-    assert found.rows[0].scores["rows"].value == 1 and found.rows[0].versus["rows"].above
-    assert clustering_table(found).values()["ours"]["pure rows"] == 1
-    assert "ours: pure rows" in verdict_table(found.rows, CLUSTER_COLUMNS, "above?").values()
+    result = compare(features, {"who": who})
+    assert result.rows[0].scores["rows"].value == 1 and result.rows[0].versus["rows"].above
+    assert clustering_table(result).values()["ours"]["pure rows"] == 1
+    assert "ours: pure rows" in verdict_table(result.rows, CLUSTER_COLUMNS, "above?").values()
 
 
 @pytest.fixture(scope="module")

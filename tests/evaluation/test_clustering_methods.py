@@ -73,9 +73,9 @@ def test_nearest_rows_are_those_of_all_distances(monkeypatch):
     features[5] = 0
     distances = pairwise_distances(features, metric="cosine")
     np.fill_diagonal(distances, np.inf)
-    found, distance = nearest_rows(features)
+    result, distance = nearest_rows(features)
     np.testing.assert_allclose(distance, distances.min(axis=1), atol=1e-7)
-    np.testing.assert_allclose(distances[np.arange(53), found], distances.min(axis=1), atol=1e-7)
+    np.testing.assert_allclose(distances[np.arange(53), result], distances.min(axis=1), atol=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -158,13 +158,13 @@ def test_nearest_rows_by_cells_are_mostly_the_nearest(many, monkeypatch):
 
 def test_ward_by_cells_is_ward_where_no_merge_crosses_a_border():
     points = groups(600, 5, count=6, apart=30)
-    found = clustering_methods.ward_in_cells(points, leaves=60, rows_per_cell=100)
+    result = clustering_methods.ward_in_cells(points, leaves=60, rows_per_cell=100)
     exact = ward_tree(points)
-    assert is_valid_linkage(exact) and len(np.unique(found["leaf"])) == len(found["tree"]) + 1 == 60
+    assert is_valid_linkage(exact) and len(np.unique(result["leaf"])) == len(result["tree"]) + 1 == 60
     for count in (2, 4, 6):
-        assert adjusted_rand_score(cut(n_clusters=count, **found), cut(exact, count)) == 1
+        assert adjusted_rand_score(cut(n_clusters=count, **result), cut(exact, count)) == 1
     with pytest.raises(ValueError, match="cannot make 61 clusters of 60 leaves"):
-        cut(n_clusters=61, **found)
+        cut(n_clusters=61, **result)
 
 
 @pytest.mark.parametrize("method", ["ward", "finch", "k-means"])

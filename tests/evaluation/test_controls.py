@@ -33,11 +33,11 @@ def net(seed: int) -> Derenderer:
 
 
 def test_a_model_whitens_itself_as_training_does(renderings):
-    found = renderings.whiten(renderings.model).whitening
+    result = renderings.whiten(renderings.model).whitening
     images = torch.from_numpy(renderings.images)
     expected = fit_whitening(renderings.model, images, SETTINGS.whitening, SETTINGS.perturb)
-    assert found is not None and sorted(found.names) == ["albedo", "geometry"]
-    for name, value in found.named_buffers():
+    assert result is not None and sorted(result.names) == ["albedo", "geometry"]
+    for name, value in result.named_buffers():
         torch.testing.assert_close(expected.get_buffer(name), value)
     assert renderings.model.whitening is None
 
@@ -53,13 +53,13 @@ def test_features_there_are_already_change_nothing(renderings, images):
 
 def test_another_encoder_is_whitened_by_its_own_codes_of_the_renderings(renderings, images):
     other = net(1)
-    found = renderings.whiten(other)
-    features, codes = (embed_images(one, images) for one in (found, other))
+    result = renderings.whiten(other)
+    features, codes = (embed_images(one, images) for one in (result, other))
     assert np.linalg.matrix_rank(features["geometry"]) <= 6 < np.linalg.matrix_rank(codes["geometry"])
     np.testing.assert_allclose(features["light"], codes["light"], rtol=1e-5)
     own = renderings.whiten(renderings.model).whitening
-    assert own is not None and found.whitening is not None
-    assert not torch.allclose(found.whitening.get_buffer("geometry_map"), own.get_buffer("geometry_map"))
+    assert own is not None and result.whitening is not None
+    assert not torch.allclose(result.whitening.get_buffer("geometry_map"), own.get_buffer("geometry_map"))
 
 
 def test_components_are_whitened_and_cached(renderings, images, tmp_path):

@@ -35,9 +35,9 @@ def defined(name: str) -> bool:
 
 @pytest.mark.parametrize("module", TABLES)
 def test_every_column_is_defined(module):
-    found = columns(module)
-    assert found, f"{module} makes no column: is it still where tables are made?"
-    assert sorted(name for name in found if not defined(name)) == []
+    result = columns(module)
+    assert result, f"{module} makes no column: is it still where tables are made?"
+    assert sorted(name for name in result if not defined(name)) == []
 
 
 def test_a_column_that_is_nowhere_is_missed():

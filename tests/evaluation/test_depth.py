@@ -157,8 +157,8 @@ def test_controls_on_rendered_faces_reach_what_is_known(shared_data):
     """Average depth 1.51e-2 and 22.4 degrees, plane 2.28e-2 and 38.9 over all 800 images; here over 200."""
     truth = read_ground_truth(shared_data("data/synface64.zip"), limit=200)
     knows = Oracle(torch.as_tensor(truth.depth), torch.as_tensor(truth.mask).float())
-    found = evaluate_geometry(knows, truth)
-    average, plane_scores = found.average_depth, found.plane
+    result = evaluate_geometry(knows, truth)
+    average, plane_scores = result.average_depth, result.plane
     assert average.side == pytest.approx(1.51e-2, abs=0.06e-2)
     assert average.mad_deg == pytest.approx(22.4, abs=0.5)
     assert plane_scores.side == pytest.approx(2.28e-2, abs=0.08e-2)

@@ -70,8 +70,10 @@ def test_both_objectives_reach_the_encoders(pictures, tmp_path):
         losses = compute_step(module, images, stream, precision, 0.5, torch.from_numpy(rows))
         assert set(losses.terms) - {"target"} <= set(finetuning.RENDERING_TERMS)
         losses.total.backward()
-        found = [model.model.nets[one].encoder.convolutions[0].weight.grad for one in ("geometry", "albedo")]
-        return losses.total.item(), torch.stack(found)
+        results = [
+            model.model.nets[one].encoder.convolutions[0].weight.grad for one in ("geometry", "albedo")
+        ]
+        return losses.total.item(), torch.stack(results)
 
     target, rendering = gradient(1.0, 0.0), gradient(1e-12, 1.0)
     both = gradient(2.0, 3.0)
@@ -117,20 +119,20 @@ def test_it_learns_beside_the_controls_and_leaves_its_start_alone(pictures, tmp_
     assert torch.equal(last, before["nets.albedo.decoder.last.weight"])
     train_task(one, pictures, tmp_path / "run")
     tuned, first, second = load_finetuned(tmp_path / "run"), Memory(tmp_path / "m"), Memory(tmp_path / "m")
-    found = finetuning.score_finetuned(tuned, one, resample_count=50, memory=first)
+    result = finetuning.score_finetuned(tuned, one, resample_count=50, memory=first)
     again = finetuning.score_finetuned(tuned, one, resample_count=50, memory=second)
-    assert str(again.values) == str(found.values) and found.values["n_unlabelled"] == 0
+    assert str(again.values) == str(result.values) and result.values["n_unlabelled"] == 0
     assert (second.made, second.recalled) == (0, first.made) and first.made == 9
     targets = one.target.asked.targets.copy()
     targets[one.target.split.train[:3]] = -1
     fewer = replace(one, target=replace(one.target, asked=replace(one.target.asked, targets=targets)))
     some = finetuning.score_finetuned(tuned, fewer, resample_count=50, memory=second)
     assert some.values["n_unlabelled"] == 3 and "3 images without label" in some.tables[0].caption
-    rows = {row.name: row.scores["balanced_accuracy"].value for row in found.result}
+    rows = {row.name: row.scores["balanced_accuracy"].value for row in result.result}
     assert rows["fine-tuned"] > 0.9 and rows["majority"] == 0.5
-    assert [found.values[name] for name in ("kind", "n_train", "n_test")] == ["labels", 24, 24]
-    assert found.values["versus"]["accuracy"]["rival"] != "fine-tuned"
-    table = found.tables[0].values()
+    assert [result.values[name] for name in ("kind", "n_train", "n_test")] == ["labels", 24, 24]
+    assert result.values["versus"]["accuracy"]["rival"] != "fine-tuned"
+    table = result.tables[0].values()
     controls = ["untrained encoder, logistic", "PCA (6), logistic", "pixels, logistic", "majority"]
     assert list(table) == ["fine-tuned", "frozen, logistic", "frozen, paper's head", *controls]
     assert rows["pixels, logistic"] > 0.9  # brightness is in the pixels themselves

@@ -31,15 +31,15 @@ LIGHT = np.array([0, 5, 10, 20, 25, 40, 50, 70, 90, 110.0])
 def test_recognition_falls_with_the_light_and_is_chance_for_noise(codes):
     angles = np.tile(LIGHT, PEOPLE).astype(np.float32)
     angles[1::2] *= -1
-    found = identify(table(codes, light_deg=angles), factors=("code",), resamples=50, cache="none")
-    rows = found.values["rows"]
+    result = identify(table(codes, light_deg=angles), factors=("code",), resamples=50, cache="none")
+    rows = result.values["rows"]
     share = {name: one["value"] for name, one in rows["code"]["scores"].items()}
     groups = {"all": 108, "<= 12": 24, "<= 25": 24, "<= 50": 24, "<= 77": 12, "beyond": 24}
-    assert found.values["probes"] == groups
+    assert result.values["probes"] == groups
     assert share["<= 12"] > 0.95 > share["<= 50"] > share["beyond"] + 0.1
     assert share["ward accuracy"] > rows["chance"]["scores"]["ward accuracy"]["value"] + 0.2
     assert rows["chance"]["scores"]["all"]["value"] == pytest.approx(1 / PEOPLE)
-    assert [name[-8:] for name in found.values["gallery"]] == ["0001.jpg"] * PEOPLE
+    assert [name[-8:] for name in result.values["gallery"]] == ["0001.jpg"] * PEOPLE
     noise = RNG.standard_normal((PEOPLE * SHOTS, 8))
     noise = identify(table(noise, light_deg=angles), factors=("code",), resamples=50, cache="none")
     assert noise.values["rows"]["code"]["scores"]["all"]["value"] == pytest.approx(1 / PEOPLE, abs=0.1)
@@ -78,8 +78,8 @@ def test_pairs_are_judged_by_a_threshold_from_other_folds(tmp_path, codes):
     different = np.array([a[:-5] != b[:-5] for a, b in zip(pairs.first, pairs.second, strict=True)])
     assert (different == ~pairs.same).mean() > 0.9  # a few pairs of "two" people are one: judged wrong
     kept = pairs.select(np.flatnonzero(different == ~pairs.same))
-    found = verify(table(exact), kept, factors=("code",), resamples=50, cache="none").values["rows"]["code"]
-    assert [found["scores"][name]["value"] for name in ("accuracy", "auc")] == [1, 1]
+    result = verify(table(exact), kept, factors=("code",), resamples=50, cache="none").values["rows"]["code"]
+    assert [result["scores"][name]["value"] for name in ("accuracy", "auc")] == [1, 1]
     noise = RNG.standard_normal((PEOPLE * SHOTS, 8))
     chance = verify(table(noise), kept, factors=("code",), resamples=50, cache="none").values
     assert chance["rows"]["code"]["scores"]["accuracy"]["value"] == pytest.approx(0.5, abs=0.12)
@@ -89,11 +89,11 @@ def test_pairs_are_judged_by_a_threshold_from_other_folds(tmp_path, codes):
 def test_pairs_of_a_half_have_all_people_in_it_and_are_balanced(tmp_path, codes):
     how = {"factors": ("code",), "resamples": 20, "cache": "none"}
     pairs = written(tmp_path / "p.txt")
-    found = {half: verify(table(codes), pairs, half=half, **how) for half in ("development", "test")}
+    result = {half: verify(table(codes), pairs, half=half, **how) for half in ("development", "test")}
     people = np.array([f"P{row}" for row in range(PEOPLE)])
     whole = FeatureTable(tuple(people), {"x": np.zeros((PEOPLE, 1))}, {"identity": people})
-    assert sum(len(half_of(whole, half)) for half in found) == PEOPLE
-    for one in found.values():
+    assert sum(len(half_of(whole, half)) for half in result) == PEOPLE
+    for one in result.values():
         words = one.tables[0].caption.split()
         assert words[1] == words[6] and 0 < one.values["pairs"] < 60
 
@@ -128,9 +128,9 @@ def test_controls_stand_beside_a_model_of_faces(tmp_path):
     images = RNG.integers(0, 256, (PEOPLE * 2, 3, 32, 32)).astype(np.uint8)
     who = np.repeat([f"P{row}" for row in range(PEOPLE)], 2)
     pictures = ImageSet(images, tuple(f"{row}.png" for row in range(len(who))), {"identity": who})
-    found = identify(model, images=pictures, untrained_seeds=1, resamples=20, cache="none")
-    assert list(found.values["rows"]) == [
+    result = identify(model, images=pictures, untrained_seeds=1, resamples=20, cache="none")
+    assert list(result.values["rows"]) == [
         "geometry + albedo", "untrained encoder", "PCA (6)", "pixels", "Gradientfaces", "HOG", "LBP",
         "chance",
     ]  # fmt: skip
-    assert any("PCA (6), whitened, is fitted to 24 images" in note for note in found.notes)
+    assert any("PCA (6), whitened, is fitted to 24 images" in note for note in result.notes)

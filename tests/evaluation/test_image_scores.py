@@ -32,8 +32,8 @@ def test_images_without_a_score_are_left_out():
     holes, nothing = ERROR.copy(), np.full(400, np.nan)
     holes[::2] = np.nan
     rows = image_rows({"model": {"e": holes, "n": nothing}, "plane": {"e": ERROR, "n": ERROR}}, ONE)
-    found = rows[0].scores["e"]
-    assert found.value == pytest.approx(ERROR[1::2].mean()) and found.low < found.value < found.high
+    result = rows[0].scores["e"]
+    assert result.value == pytest.approx(ERROR[1::2].mean()) and result.low < result.value < result.high
     assert np.isnan(rows[0].scores["n"].value) and not rows[0].versus["n"].above
 
 

@@ -25,9 +25,9 @@ def knowing(scenes: Scene, turn: float = 0.0) -> Derenderer:
     state = {"at": 0}
 
     def decompose(images) -> Scene:
-        found = scenes[state["at"] : state["at"] + len(images)]
+        result = scenes[state["at"] : state["at"] + len(images)]
         state["at"] = (state["at"] + len(images)) % len(scenes)
-        return found.with_parameters(camera=found.camera + torch.tensor([0, turn, 0, 0, 0, 0.0]))
+        return result.with_parameters(camera=result.camera + torch.tensor([0, turn, 0, 0, 0, 0.0]))
 
     model.decompose = decompose
     return model
@@ -50,30 +50,30 @@ def pictures(made) -> ImageSet:
     return ImageSet(made.images, tuple(f"a/{row}.png" for row in range(len(made.images))), labels)
 
 
-def score(found, angle: str, row: str = "model") -> dict[str, float]:
-    return {name: one["value"] for name, one in found.values[angle][row]["scores"].items()}
+def score(result, angle: str, row: str = "model") -> dict[str, float]:
+    return {name: one["value"] for name, one in result.values[angle][row]["scores"].items()}
 
 
 def test_agreement_is_that_of_numpy_also_on_resamples():
     true, weights = RNG.standard_normal(50), group_resamples(np.arange(50), 3)
     predicted = 0.4 * true + 2 + 0.1 * RNG.standard_normal(50)
-    found = agreement(predicted, true, weights)
-    assert found["r"].value == pytest.approx(np.corrcoef(predicted, true)[0, 1])
-    assert found["slope"].value == pytest.approx(np.polyfit(true, predicted, 1)[0])
-    assert found["offset"].value == pytest.approx((predicted - true).mean())
+    result = agreement(predicted, true, weights)
+    assert result["r"].value == pytest.approx(np.corrcoef(predicted, true)[0, 1])
+    assert result["slope"].value == pytest.approx(np.polyfit(true, predicted, 1)[0])
+    assert result["offset"].value == pytest.approx((predicted - true).mean())
     drawn = np.repeat(np.arange(50), weights[1].astype(int))
     expected = np.corrcoef(predicted[drawn], true[drawn])[0, 1]
-    assert found["r"].resampled[1] == pytest.approx(expected)
+    assert result["r"].resampled[1] == pytest.approx(expected)
     assert np.isnan(agreement(np.ones(50), true, weights)["r"].value)
 
 
 def test_pose_is_exact_up_to_a_constant_turn(made, scenes, tmp_path):
-    found = pose(knowing(scenes, 0.1), pictures(made), **QUICK)
+    result = pose(knowing(scenes, 0.1), pictures(made), **QUICK)
     for angle, offset in (("yaw", np.degrees(0.1)), ("pitch", 0), ("roll", 0)):
-        own = score(found, angle)
+        own = score(result, angle)
         assert (own["r"], own["slope"]) == (pytest.approx(1, abs=1e-4), pytest.approx(1, abs=1e-3))
         assert own["error"] == pytest.approx(0, abs=1e-3) and own["offset"] == pytest.approx(offset, abs=1e-3)
-        assert score(found, angle, "constant answer")["slope"] == pytest.approx(0)
+        assert score(result, angle, "constant answer")["slope"] == pytest.approx(0)
     names = np.array([f"elsewhere/{row}.png" for row in range(0, 24, 2)])
     columns = {"yaw": 1, "pitch": 0, "roll": 2}
     degrees = {name: np.degrees(made.camera[::2, column]) for name, column in columns.items()}
@@ -88,11 +88,11 @@ def test_pose_is_exact_up_to_a_constant_turn(made, scenes, tmp_path):
 
 
 def test_light_is_exact_in_the_frame_of_the_camera(made, scenes):
-    found = light(knowing(scenes), pictures(made), **QUICK)
+    result = light(knowing(scenes), pictures(made), **QUICK)
     for angle in ("azimuth", "elevation"):
-        assert score(found, angle)["error"] == pytest.approx(0, abs=0.01)
-        assert score(found, angle, "constant answer")["error"] > 5
-    assert score(found, "direction")["all"] == pytest.approx(0, abs=0.01)
+        assert score(result, angle)["error"] == pytest.approx(0, abs=0.01)
+        assert score(result, angle, "constant answer")["error"] > 5
+    assert score(result, "direction")["all"] == pytest.approx(0, abs=0.01)
 
 
 def test_a_wrong_table_is_named(tmp_path, made):
@@ -111,13 +111,13 @@ def test_relighting_by_the_true_ratio_is_best(tmp_path):
             noise = RNG.integers(-20, 20, (96, 84)) * (person + 1) / 3
             Image.fromarray(((grey + noise) * gain).clip(0, 255).astype(np.uint8)).save(tmp_path / name)
     model = Derenderer.from_preset("small", image_size=32, width=4, light_width=4, code_size=12).eval()
-    found = relight(model, tmp_path, size=32, **QUICK)
-    psnr = {name: row["scores"]["all"]["value"] for name, row in found.values["psnr"].items()}
+    result = relight(model, tmp_path, size=32, **QUICK)
+    psnr = {name: row["scores"]["all"]["value"] for name, row in result.values["psnr"].items()}
     assert list(psnr) == [
         "photograph relit", "model's rendering", "input", "mean image", "another person's ratio"
     ]  # fmt: skip
-    assert psnr["another person's ratio"] > psnr["input"] + 3 and found.values["pictures"] == 6
-    columns = [column.name for column in found.tables[0].columns if column.name != "95 %"]
+    assert psnr["another person's ratio"] > psnr["input"] + 3 and result.values["pictures"] == 6
+    columns = [column.name for column in result.tables[0].columns if column.name != "95 %"]
     assert columns == ["all", "<= 25", "<= 77"]
     with pytest.raises(ValueError, match="has no label 'identity'"):
         relight(model, read_images(tmp_path, 32, dataset="folder"), size=32)
@@ -134,8 +134,8 @@ def test_brightness_of_the_true_albedo_has_slope_1(made, scenes):
     groups = np.where(skin > 0.55, "light", "dark")
     images = (255 * np.broadcast_to(skin[:, None, None, None], made.images.shape)).astype(np.uint8)
     known = ImageSet(images, tuple(map(str, range(24))), {"race": groups})
-    found = brightness(knowing(scenes), known, by="race", **QUICK)
-    share = {name: row["scores"]["share"]["value"] for name, row in found.values["share"].items()}
+    result = brightness(knowing(scenes), known, by="race", **QUICK)
+    share = {name: row["scores"]["share"]["value"] for name, row in result.values["share"].items()}
     assert share["model"] == pytest.approx(1, abs=0.02) and abs(share["untrained model"]) < 0.3
     with pytest.raises(ValueError, match="an image set holds no true albedo"):
         brightness(knowing(scenes), known)

@@ -107,7 +107,7 @@ def test_heads_trained_at_once_are_those_trained_one_by_one_in_plain_torch(kind)
         targets[3, 1] = -1
     rows, tested, seeds = np.stack([np.arange(20), np.arange(10, 30)]), np.arange(40, 60), (4, 5)
     together = train_heads(features, targets, rows, tested, kind=kind, seeds=seeds, settings=QUICK)
-    for own, seed, found in zip(rows, seeds, together, strict=True):
+    for own, seed, result in zip(rows, seeds, together, strict=True):
         generator, reach = torch.Generator().manual_seed(seed), features.shape[1] ** 0.5
         head = torch.nn.Linear(features.shape[1], targets.shape[1])
         head.weight.data = ((torch.rand(head.weight.T.shape, generator=generator) * 2 - 1) / reach).T
@@ -124,7 +124,7 @@ def test_heads_trained_at_once_are_those_trained_one_by_one_in_plain_torch(kind)
                 loss.backward()
                 optimiser.step()
         answer = head(x[tested]).sigmoid() if kind == "labels" else head(x[tested]).softmax(dim=1)
-        np.testing.assert_allclose(found, answer.detach().numpy(), atol=2e-6)
+        np.testing.assert_allclose(result, answer.detach().numpy(), atol=2e-6)
 
 
 @pytest.mark.parametrize(("rows", "dimensions"), [(80, 10), (30, 90)])
@@ -200,8 +200,8 @@ def test_neighbours_are_scikit_learns():
     centred = features - features[:50].mean(axis=0)
     oracle = KNeighborsClassifier(10, metric="cosine").fit(centred[:50], targets[:50])
     expected = np.stack([share[:, 1] for share in oracle.predict_proba(centred[50:])], axis=1)
-    found = linear_probes.nearest_answers(features[:50], targets[:50], features[50:])
-    np.testing.assert_allclose(found, expected)
+    result = linear_probes.nearest_answers(features[:50], targets[:50], features[50:])
+    np.testing.assert_allclose(result, expected)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -209,33 +209,33 @@ def test_scores_of_labels_are_scikit_learns(seed):
     rng = np.random.default_rng(seed)
     targets = rng.integers(0, 2, (rng.integers(6, 31), rng.integers(1, 5))).astype(np.int8)
     targets[:2], answers = [[0], [1]], rng.random(targets.shape).round(1) + 0.01
-    found = linear_scores(targets, answers, "labels")
+    result = linear_scores(targets, answers, "labels")
     columns = list(zip(targets.T, answers.T, strict=True))
     plain = [(accuracy_score(y, p > 0.5), balanced_accuracy_score(y, p > 0.5)) for y, p in columns]
-    assert [found.accuracy, found.balanced_accuracy] == pytest.approx(np.mean(plain, axis=0))
+    assert [result.accuracy, result.balanced_accuracy] == pytest.approx(np.mean(plain, axis=0))
     precision = np.mean([average_precision_score(y, p) for y, p in columns])
-    assert found.average_precision == pytest.approx(precision)
+    assert result.average_precision == pytest.approx(precision)
 
 
 def test_scores_of_classes_are_scikit_learns():
     rng = np.random.default_rng(0)
     classes = np.concatenate([rng.integers(0, 4, 40), [0, 1, 2, 3]])
     targets, answers = (classes[:, None] == np.arange(5)).astype(np.int8), rng.random((44, 5))
-    found = linear_scores(targets, answers, "classes")
-    assert found.accuracy == pytest.approx(accuracy_score(classes, answers.argmax(axis=1)))
-    assert found.balanced_accuracy == pytest.approx(
+    result = linear_scores(targets, answers, "classes")
+    assert result.accuracy == pytest.approx(accuracy_score(classes, answers.argmax(axis=1)))
+    assert result.balanced_accuracy == pytest.approx(
         recall_score(classes, answers.argmax(axis=1), labels=range(4), average="macro")
     )
     precisions = [average_precision_score(targets[:, one], answers[:, one]) for one in range(4)]
-    assert found.average_precision == pytest.approx(np.mean(precisions))
+    assert result.average_precision == pytest.approx(np.mean(precisions))
 
 
 def test_resampled_scores_are_those_of_rows_written_out():
     rng = np.random.default_rng(0)
     targets, answers = rng.integers(-1, 2, (30, 3)).astype(np.int8), rng.random((30, 3))
     weights = rng.multinomial(30, np.full(30, 1 / 30), size=5).astype(np.float32)
-    found = count_scores(targets, answers, "labels", weights)
-    for drawn, scores in zip(weights, found, strict=True):
+    result = count_scores(targets, answers, "labels", weights)
+    for drawn, scores in zip(weights, result, strict=True):
         rows = np.repeat(np.arange(30), drawn.astype(int))
         written = linear_scores(targets[rows], answers[rows], "labels")
         assert scores == pytest.approx([written.accuracy, written.balanced_accuracy])
@@ -247,17 +247,17 @@ def comparison(tmp_path=None, **options):
     rows = choose_rows(task, files(200), (20, 60), (0, 1, 2))
     noise = [np.random.default_rng(seed).normal(size=(200, 5)) for seed in range(2)]
     memory = Memory(tmp_path)
-    found = compare_linear(
+    result = compare_linear(
         {"ours": [features], "noise": noise}, task, rows, (0, 1, 2),
         controls=("noise",), settings=QUICK, resample_count=100, memory=memory, **options,
     )  # fmt: skip
-    return found, memory, task, rows
+    return result, memory, task, rows
 
 
 def test_features_that_hold_the_labels_are_above_every_control(tmp_path):
-    found, memory, task, rows = comparison(tmp_path)
-    assert [(part.head, part.count) for part in found.parts] == [(h, n) for h in HEADS for n in (20, 60)]
-    logistic = next(part for part in found.parts if (part.head, part.count) == ("logistic", 60))
+    result, memory, task, rows = comparison(tmp_path)
+    assert [(part.head, part.count) for part in result.parts] == [(h, n) for h in HEADS for n in (20, 60)]
+    logistic = next(part for part in result.parts if (part.head, part.count) == ("logistic", 60))
     ours, noise, majority = logistic.rows
     assert ours.versus["accuracy"].above and ours.versus["balanced_accuracy"].above
     assert ours.scores["accuracy"].value > 0.85 and ours.runs == 3 and ours.scores["accuracy"].deviation > 0
@@ -265,11 +265,11 @@ def test_features_that_hold_the_labels_are_above_every_control(tmp_path):
     answers = linear_probes.majority_answers(task, rows.train[60], 100)[0]
     expected = linear_scores(task.targets[rows.test], answers, "labels")
     assert majority.scores["balanced_accuracy"].value == 0.5 and expected.balanced_accuracy == 0.5
-    assert majority.control and found.n_test == 100
+    assert majority.control and result.n_test == 100
     made = memory.made
     again, memory, *_ = comparison(tmp_path)
     assert made == memory.recalled == 18 and memory.made == 0  # 3 heads x 2 counts x (1 + 2) runs
-    assert str(again.numbers()) == str(found.numbers())
+    assert str(again.numbers()) == str(result.numbers())
     assert not any(row.versus["average_precision"].above for row in logistic.rows if row.versus)
 
 

@@ -19,8 +19,8 @@ def test_the_same_inputs_are_computed_once(tmp_path):
 
     memory = Memory(tmp_path)
     for _ in range(2):
-        found = memory.recall("tree", {"x": np.ones(4), "k": 3}, make)
-        assert found["a"].tolist() == [0, 1, 2] and found["b"].dtype == np.float32
+        result = memory.recall("tree", {"x": np.ones(4), "k": 3}, make)
+        assert result["a"].tolist() == [0, 1, 2] and result["b"].dtype == np.float32
     assert (len(calls), memory.made, memory.recalled) == (1, 1, 1)
     memory.recall("tree", {"x": np.ones(4), "k": 4}, make)
     memory.recall("other", {"x": np.ones(4), "k": 3}, make)

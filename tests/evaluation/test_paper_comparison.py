@@ -15,14 +15,14 @@ def table(**labels) -> FeatureTable:
 
 def lines_of_the_paper(text: str) -> list[tuple[str, list[float]]]:
     """Every line of the paper's tables that has numbers: the method's name, and the numbers after it."""
-    found = []
+    results = []
     for line in re.findall(r"^(.*?&.*?)\\\\", text, re.MULTILINE):
         cells = re.sub(r"\\cite\{[^}]*\}|\\textbf|\\texttt|\$.*?\$|[{}\s]", "", line).split("&")
         method = re.sub(r"\(.*?\)", "", cells[0])
         numbers = [float(cell) for cell in cells[1:] if re.fullmatch(r"0\.\d+", cell)]
         if numbers:
-            found.append((method, numbers))
-    return found
+            results.append((method, numbers))
+    return results
 
 
 def test_every_number_is_the_papers(shared_data):
@@ -81,16 +81,16 @@ def test_background_people_and_other_sports_cars_are_none_of_the_papers_classes(
         count = len(next(iter(labels.values())))
         features = {"geometry": np.random.default_rng(0).normal(size=(count, 4))}
         rows = {"ours": FeatureTable(tuple(map(str, range(count))), features, labels)}
-        found = compare(table, rows, factors=None, resamples=20, cache="none")
-        part = found.values["parts"][table]
+        result = compare(table, rows, factors=None, resamples=20, cache="none")
+        part = result.values["parts"][table]
         assert part["n_rows"] == kept
-        assert f"{count - kept} rows left out that are none" in " ".join(found.notes)
+        assert f"{count - kept} rows left out that are none" in " ".join(result.notes)
         assert part["labels"] == {"identity" if table == "identity" else "class": len(classes)}
 
 
 def test_clustering_tables_have_rows_of_finch_beside_ward():
-    found = compare("emotion", tables_of(), resamples=20, cache="none")
-    values = found.tables[0].values()
+    result = compare("emotion", tables_of(), resamples=20, cache="none")
+    values = result.tables[0].values()
     assert values["ours"]["accuracy"] == values["ours, FINCH"]["accuracy"] == 1
     alone = compare("emotion", tables_of(), method="finch", resamples=20, cache="none")
     assert "ours, FINCH" not in alone.tables[0].values()

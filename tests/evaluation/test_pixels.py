@@ -98,8 +98,8 @@ def test_masks_too_small_for_a_window_have_no_score():
     prediction, target = pair()
     mask = torch.zeros(2, 24, 29)
     mask[0, : WINDOW - 1], mask[1] = 1, 1
-    found = masked_ssim(prediction, target, mask)
-    assert found.isnan().tolist() == [True, False]
+    result = masked_ssim(prediction, target, mask)
+    assert result.isnan().tolist() == [True, False]
     scores = reconstruction_scores(prediction, target, mask)
-    assert scores.ssim == pytest.approx(found[1].item()) and scores.n_empty == 0
+    assert scores.ssim == pytest.approx(result[1].item()) and scores.n_empty == 0
     assert masked_ssim(prediction[..., :8, :8], target[..., :8, :8], mask[..., 16:, 16:24]).isnan().all()

@@ -21,11 +21,11 @@ def test_same_as_scikit_learn(table, factor, metric, monkeypatch):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", 64)
     rows = table.factors[factor].astype(np.float64)
     query = rows[:7] + 0.1
-    found = [nearest(table, one, factor, 9, metric=metric) for one in query]
+    results = [nearest(table, one, factor, 9, metric=metric) for one in query]
     other = NearestNeighbors(n_neighbors=9, metric=metric, algorithm="brute").fit(rows)
     distances, places = other.kneighbors(query)
-    np.testing.assert_array_equal([rows for rows, _ in found], places)
-    np.testing.assert_allclose([away for _, away in found], distances, atol=1e-9)
+    np.testing.assert_array_equal([rows for rows, _ in results], places)
+    np.testing.assert_allclose([away for _, away in results], distances, atol=1e-9)
 
 
 def test_equal_rows_come_in_order_and_zero_rows_are_apart():

@@ -37,9 +37,9 @@ def test_duckdb_counts_the_rows_of_each_kind(table):
 def test_faiss_finds_the_rows_that_search_finds(table):
     names = run("faiss", "IndexFlatIP")
     for row, (similarity, nearest) in enumerate(zip(names["similarity"], names["neighbours"], strict=True)):
-        found = search(table, table.files[row], factor="geometry", k=9)
-        assert list(nearest) == [row, *found.rows]
-        np.testing.assert_allclose(similarity[1:], 1 - np.array(found.distances), atol=1e-6)
+        result = search(table, table.files[row], factor="geometry", k=9)
+        assert list(nearest) == [row, *result.rows]
+        np.testing.assert_allclose(similarity[1:], 1 - np.array(result.distances), atol=1e-6)
 
 
 @pytest.mark.parametrize("storage", ["Flat", "SQ8"])
@@ -51,6 +51,6 @@ def test_an_index_of_cells_finds_the_exact_neighbours(tmp_path, monkeypatch, sto
     rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
     files = tuple(f"{row}.png" for row in range(20_000))
     FeatureTable(files, {"geometry": rows}, {}).write("features.parquet")
-    found = run("faiss", "IVF128,Flat", storage)["neighbours"]
+    result = run("faiss", "IVF128,Flat", storage)["neighbours"]
     exact = np.argsort(-rows[:200] @ rows.T, axis=1)[:, :10]
-    assert np.mean([len(np.intersect1d(*pair)) for pair in zip(found, exact, strict=True)]) > 9.5
+    assert np.mean([len(np.intersect1d(*pair)) for pair in zip(result, exact, strict=True)]) > 9.5

@@ -29,9 +29,9 @@ def stopped(model, pictures, tmp_path, monkeypatch):
 
 
 def same_table(file, wanted: FeatureTable) -> bool:
-    found = FeatureTable.read(file)
-    same = (np.array_equal(found.factors[name], wanted.factors[name]) for name in wanted.factors)
-    return found.files == wanted.files and all(same)
+    result = FeatureTable.read(file)
+    same = (np.array_equal(result.factors[name], wanted.factors[name]) for name in wanted.factors)
+    return result.files == wanted.files and all(same)
 
 
 def flipped(file) -> None:

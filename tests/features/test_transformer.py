@@ -53,11 +53,11 @@ def test_every_form_of_picture_gives_the_same_features(model, pictures, tmp_path
 def test_the_model_is_loaded_late_once_and_a_copy_carries_its_path_not_its_weights(loads, pictures):
     transformer = DisentangledFeatures("runs/x")
     assert loads == []
-    found = transformer.fit(pictures.images).transform(pictures.images)
+    result = transformer.fit(pictures.images).transform(pictures.images)
     assert loads == [("runs/x", "cpu")]
     copy = pickle.loads(pickle.dumps(transformer))
     assert "_model" not in vars(copy)
-    np.testing.assert_array_equal(copy.transform(pictures.images), found)
+    np.testing.assert_array_equal(copy.transform(pictures.images), result)
     transformer.set_params(model="runs/y").transform(pictures.images)
     assert loads[1:] == [("runs/x", "cpu"), ("runs/y", "cpu")]
 

@@ -54,8 +54,8 @@ class Looking:
         encoder = self.nets[name].encoder
         return activations(encoder(images), encoder.spatial(images))
 
-    def features_from(self, found: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        return {name: value[:, :CODE] for name, value in found.items()}
+    def features_from(self, result: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        return {name: value[:, :CODE] for name, value in result.items()}
 
 
 @pytest.fixture
@@ -134,15 +134,15 @@ def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, 
 
 def test_new_weights_change_the_map_and_the_same_weights_do_not(model, probe, images):
     targets = np.zeros(3, np.int64)
-    found = sanity_check(model, probe, probe, images, targets, methods=("pixels", "hires-cam"), seeds=(1, 2))
-    by = {(row.method, row.factor, row.changed): row for row in found}
+    result = sanity_check(model, probe, probe, images, targets, methods=("pixels", "hires-cam"), seeds=(1, 2))
+    by = {(row.method, row.factor, row.changed): row for row in result}
     assert len(by) == 2 * 4 * 3
     for factor in probe.factors:
         kept = by["pixels", factor, "shuffled labels"]  # the very same probe: nothing was changed
         assert kept.spearman == pytest.approx(1) and kept.ssim == pytest.approx(1, abs=1e-5)
         assert by["pixels", factor, "random weights"].spearman < 0.9
     again = sanity_check(model, probe, probe, images, targets, methods=("pixels",), seeds=(1, 2))
-    assert again == [row for row in found if row.method == "pixels"]
+    assert again == [row for row in result if row.method == "pixels"]
 
 
 def test_a_map_that_ignores_the_weights_is_not_trusted():

@@ -22,8 +22,8 @@ def features() -> dict[str, np.ndarray]:
 def labels(features) -> dict[str, np.ndarray]:
     score = features["geometry"][:, 0]
     sizes = np.digitize(score, [-0.5, 0.5]).astype(np.int64)
-    found = {"smiling": (score > 0).astype(np.int8), "size": sizes, "age": score.astype(np.float64)}
-    return {**found, "same": np.full(N, "one"), "few": np.where(np.arange(N) < 5, "a", "")}
+    result = {"smiling": (score > 0).astype(np.int8), "size": sizes, "age": score.astype(np.float64)}
+    return {**result, "same": np.full(N, "one"), "few": np.where(np.arange(N) < 5, "a", "")}
 
 
 @pytest.mark.parametrize("name", ["smiling", "size"])

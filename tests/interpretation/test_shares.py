@@ -30,7 +30,7 @@ def weight() -> np.ndarray:
 def test_attributions_sum_to_the_change_of_the_answer(z, weight, kind, output):
     probe = probe_of(weight, kind=kind)
     start = np.full(12, 0.1)
-    found, error = integrated_gradients(probe, z, 1, baseline=start, output=output)
+    result, error = integrated_gradients(probe, z, 1, baseline=start, output=output)
 
     def answer(values):
         logits = values @ weight.T.astype(np.float64) + probe.bias
@@ -41,7 +41,7 @@ def test_attributions_sum_to_the_change_of_the_answer(z, weight, kind, output):
         return np.exp(logits[:, 1]) / np.exp(logits).sum(axis=1)
 
     change = answer(z.astype(np.float64)) - answer(start[None])
-    np.testing.assert_allclose(found.sum(axis=1), change, atol=2e-5)
+    np.testing.assert_allclose(result.sum(axis=1), change, atol=2e-5)
     assert np.abs(error).max() < 2e-5
 
 
@@ -101,8 +101,8 @@ def explained(known, **words):
 
 
 def test_the_factor_that_knows_has_the_share_and_the_drop(known):
-    found = explained(known, baseline="mean")
-    model, *controls = found.rows
+    result = explained(known, baseline="mean")
+    model, *controls = result.rows
     assert [row.name for row in controls] == ["shuffled labels", "untrained encoder"]
     assert all(row.control for row in controls) and not model.control
     shares = model.shares.mean(axis=0)
@@ -126,10 +126,10 @@ def test_a_zero_baseline_counts_a_constant_feature_and_the_same_seed_repeats(kno
 def test_classes_are_explained_on_their_own_pictures(known):
     features, _, rows = known
     third = np.digitize(features["geometry"][:, 0], [-0.5, 0.5])
-    found = explain_labels(features, task_of({"third": third}), rows, seeds=(0, 1), baseline="mean")
-    assert found.names == ("0", "1", "2") and found.rows[0].shares.shape == (2, 3, 3)
-    assert (found.rows[0].shares.mean(axis=0)[[0, 2]].argmax(axis=1) == 0).all()
-    assert (found.rows[0].auc[:, [0, 2]] > 0.85).all()
+    result = explain_labels(features, task_of({"third": third}), rows, seeds=(0, 1), baseline="mean")
+    assert result.names == ("0", "1", "2") and result.rows[0].shares.shape == (2, 3, 3)
+    assert (result.rows[0].shares.mean(axis=0)[[0, 2]].argmax(axis=1) == 0).all()
+    assert (result.rows[0].auc[:, [0, 2]] > 0.85).all()
 
 
 def test_an_explanation_refuses_what_does_not_fit(known):

@@ -100,9 +100,9 @@ def assert_same(actual, expected, inputs, generator):
     """Outputs, and the gradient of every input."""
     assert_agrees(actual, expected)
     seed = generator.get_state()
-    found = gradients(actual, inputs, generator)
+    result = gradients(actual, inputs, generator)
     wanted = gradients(expected, inputs, generator.set_state(seed))
-    for index, (a, b) in enumerate(zip(found, wanted, strict=True)):
+    for index, (a, b) in enumerate(zip(result, wanted, strict=True)):
         assert_agrees(a, b, f"gradient of input {index}")
 
 

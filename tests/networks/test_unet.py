@@ -26,8 +26,8 @@ def test_the_papers_decoder_has_the_parameters_of_its_widths():
             expected += below * width * 4 + width
             expected += (1 + encoders) * width * width * 9 + width * width * 9 + 2 * 2 * width
             below = width
-        found = sum(p.numel() for p in UNetDecoder(widths, encoders, 19).parameters())
-        assert found == expected
+        result = sum(p.numel() for p in UNetDecoder(widths, encoders, 19).parameters())
+        assert result == expected
 
 
 def test_the_joint_net_uses_both_centres_once():

@@ -132,9 +132,9 @@ def test_files_of_old_torch_and_flat_names_are_read_too(checkpoint, file, tmp_pa
     _, expected = read_checkpoint(file)
     nets = ("netD", "netA", "netL", "netV")
     flat = {f"{net}.{name}": value for net in nets for name, value in checkpoint[net].items()}
-    _, found = read_checkpoint(saved(flat, tmp_path, _use_new_zipfile_serialization=False))
-    assert found and all(torch.equal(found[name], expected[name]) for name in found)
-    assert not any(name.startswith("nets.confidence") for name in found)
+    _, result = read_checkpoint(saved(flat, tmp_path, _use_new_zipfile_serialization=False))
+    assert result and all(torch.equal(result[name], expected[name]) for name in result)
+    assert not any(name.startswith("nets.confidence") for name in result)
 
 
 class Meter:

@@ -117,12 +117,12 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torc
 def weights():
     """Random weights under torchvision's names, with a later layer and a classifier that must be ignored."""
     generator = torch.Generator().manual_seed(0)
-    found = {"features.17.weight": torch.zeros(2, 2), "classifier.0.weight": torch.zeros(3)}
+    result = {"features.17.weight": torch.zeros(2, 2), "classifier.0.weight": torch.zeros(3)}
     for number, fan_in, fan_out in zip(NUMBERS, CHANNELS[:-1], CHANNELS[1:], strict=True):
         scale = (2 / (9 * fan_in)) ** 0.5
-        found[f"features.{number}.weight"] = torch.randn(fan_out, fan_in, 3, 3, generator=generator) * scale
-        found[f"features.{number}.bias"] = torch.randn(fan_out, generator=generator) * 0.1
-    return found
+        result[f"features.{number}.weight"] = torch.randn(fan_out, fan_in, 3, 3, generator=generator) * scale
+        result[f"features.{number}.bias"] = torch.randn(fan_out, generator=generator) * 0.1
+    return result
 
 
 def relu3_3(weights, images):
@@ -151,9 +151,9 @@ def write(weights, path):
 def test_every_container_gives_the_features_by_definition(weights, tmp_path, generator, suffix):
     net = load_vgg16(write(weights, tmp_path / f"vgg{suffix}"))
     images = torch.rand(2, 3, 16, 24, generator=generator)
-    found = net(images)
-    assert found.shape == (2, net.channels, 16 // net.stride, 24 // net.stride)
-    torch.testing.assert_close(found, relu3_3(weights, images), rtol=1e-4, atol=1e-5)
+    result = net(images)
+    assert result.shape == (2, net.channels, 16 // net.stride, 24 // net.stride)
+    torch.testing.assert_close(result, relu3_3(weights, images), rtol=1e-4, atol=1e-5)
 
 
 @PICKLED

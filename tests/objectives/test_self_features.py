@@ -101,8 +101,8 @@ def test_training_learns_to_recognise_places_and_to_order_distortions(generator)
             return (net(images) - target).square().mean().item()
 
         shifts = {f"shift {pixels}": distance(unseen.roll(pixels, 3)) for pixels in (1, 2, 4)}
-        found = {"darker": distance(unseen * 0.8), **shifts}
-        return {name: value / distance(unseen.roll(1, 0)) for name, value in found.items()}
+        result = {"darker": distance(unseen * 0.8), **shifts}
+        return {name: value / distance(unseen.roll(1, 0)) for name, value in result.items()}
 
     after, before = distances(trained), distances(untrained)
     assert after["shift 1"] < after["shift 2"] < after["shift 4"] < 1.2

@@ -61,22 +61,22 @@ def relief(depth: torch.Tensor) -> torch.Tensor:
 def test_a_scene_is_found_from_its_picture(maps, truth, wrong):
     pictures = render_scene(truth).image
     fitting = Fitting(maps, FittingSettings(prior=0.05))
-    found = fitting.fit(pictures, wrong, render_scene, 200)
-    assert (found.after < 0.25 * found.before).all()
+    result = fitting.fit(pictures, wrong, render_scene, 200)
+    assert (result.after < 0.25 * result.before).all()
 
     def apart(scene: Scene) -> dict[str, float]:
-        found = {"relief": relief(scene.depth) - relief(truth.depth), "albedo": scene.albedo - truth.albedo}
-        found["light"] = (scene.light[:, 2:] - truth.light[:, 2:]).norm(dim=1)
-        found["yaw"] = scene.camera[:, 1] - truth.camera[:, 1]
-        return {name: float(value.abs().mean()) for name, value in found.items()}
+        result = {"relief": relief(scene.depth) - relief(truth.depth), "albedo": scene.albedo - truth.albedo}
+        result["light"] = (scene.light[:, 2:] - truth.light[:, 2:]).norm(dim=1)
+        result["yaw"] = scene.camera[:, 1] - truth.camera[:, 1]
+        return {name: float(value.abs().mean()) for name, value in result.items()}
 
-    before, after = apart(wrong), apart(found.scene)
+    before, after = apart(wrong), apart(result.scene)
     assert after["relief"] < 0.2 * before["relief"]
     assert all(after[name] < 0.6 * before[name] for name in before), (before, after)
-    assert set(found.coordinates) == {"geometry", "albedo"}
+    assert set(result.coordinates) == {"geometry", "albedo"}
     for factor, parameter in (("geometry", "depth"), ("albedo", "albedo")):
-        made = maps.maps(parameter, found.coordinates[factor]).clamp(0, 1 if factor == "albedo" else 2)
-        torch.testing.assert_close(made, found.scene.parameters[parameter])
+        made = maps.maps(parameter, result.coordinates[factor]).clamp(0, 1 if factor == "albedo" else 2)
+        torch.testing.assert_close(made, result.scene.parameters[parameter])
 
 
 def test_each_picture_is_fitted_by_itself(maps, truth, wrong):
@@ -115,25 +115,25 @@ def test_what_was_given_stays_and_no_gradient_is_left(maps, truth, wrong):
     pictures = render_scene(truth).image
     kept = [value.clone() for value in (pictures, *wrong.parameters.values())]
     with torch.inference_mode():
-        found = Fitting(maps, FittingSettings(steps=3)).fit(pictures, wrong, render_scene)
+        result = Fitting(maps, FittingSettings(steps=3)).fit(pictures, wrong, render_scene)
     assert all(torch.equal(a, b) for a, b in zip(kept, (pictures, *wrong.parameters.values()), strict=True))
-    assert not any(value.requires_grad for value in found.scene.parameters.values())
-    assert not any(value.requires_grad for value in found.coordinates.values())
+    assert not any(value.requires_grad for value in result.scene.parameters.values())
+    assert not any(value.requires_grad for value in result.coordinates.values())
 
 
 def test_light_and_view_stay_where_a_renderer_holds(maps, truth, wrong):
     noise = torch.rand(COUNT, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(3))
-    found = Fitting(maps, FittingSettings(steps=80, prior=0)).fit(noise, wrong, render_scene)
-    assert all(bool(value.isfinite().all()) for value in found.scene.parameters.values())
-    assert bool((found.scene.light[:, 2:].abs() <= math.radians(80) + 1e-6).all())
-    assert bool((found.scene.light[:, :2] > 0).all())
-    assert bool((found.scene.camera[:, :3].abs() <= math.radians(75) + 1e-6).all())
+    result = Fitting(maps, FittingSettings(steps=80, prior=0)).fit(noise, wrong, render_scene)
+    assert all(bool(value.isfinite().all()) for value in result.scene.parameters.values())
+    assert bool((result.scene.light[:, 2:].abs() <= math.radians(80) + 1e-6).all())
+    assert bool((result.scene.light[:, :2] > 0).all())
+    assert bool((result.scene.camera[:, :3].abs() <= math.radians(75) + 1e-6).all())
 
 
 def test_a_scene_that_is_seen_nowhere_gives_numbers(maps, truth, wrong):
     away = wrong.with_parameters(camera=torch.tensor([[0, 0, 0, 5.0, 0, 0]]).repeat(COUNT, 1))
-    found = Fitting(maps, FittingSettings(steps=2)).fit(truth.albedo, away, render_scene)
-    assert bool(found.after.isfinite().all()) and bool(found.scene.depth.isfinite().all())
+    result = Fitting(maps, FittingSettings(steps=2)).fit(truth.albedo, away, render_scene)
+    assert bool(result.after.isfinite().all()) and bool(result.scene.depth.isfinite().all())
 
 
 def test_no_steps_and_steps_without_examples_are_refused(maps, truth, wrong):

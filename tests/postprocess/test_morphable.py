@@ -18,10 +18,10 @@ def planted(count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
 def test_maps_come_back_and_coordinates_are_standard_deviations():
     maps, amounts = planted()
     model = MorphableMaps.of({"depth": maps}, 3)
-    found = model.coordinates("depth", maps)
-    torch.testing.assert_close(model.maps("depth", found), maps, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(found.mean(0), torch.zeros(3), rtol=0, atol=1e-4)
-    torch.testing.assert_close(found.square().mean(0), torch.ones(3), rtol=1e-3, atol=0)
+    result = model.coordinates("depth", maps)
+    torch.testing.assert_close(model.maps("depth", result), maps, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(result.mean(0), torch.zeros(3), rtol=0, atol=1e-4)
+    torch.testing.assert_close(result.square().mean(0), torch.ones(3), rtol=1e-3, atol=0)
     lengths = model.get_buffer("depth_axes").flatten(1).norm(dim=1)
     assert (lengths[:-1] >= lengths[1:]).all()
     spread = (amounts - amounts.mean(0)).square().sum() / len(maps) * 2  # a pattern stands there twice
@@ -42,8 +42,8 @@ def test_no_more_coordinates_than_can_be_told(shape):
     maps = torch.rand(shape, generator=torch.Generator().manual_seed(2))
     model = MorphableMaps.of({"depth": maps}, 1_000)
     assert model.size("depth") == min(shape[0] - 1, shape[1] * shape[2])
-    found = model.coordinates("depth", maps)
-    torch.testing.assert_close(model.maps("depth", found), (maps + maps.flip(-1)) / 2, rtol=1e-3, atol=1e-4)
+    result = model.coordinates("depth", maps)
+    torch.testing.assert_close(model.maps("depth", result), (maps + maps.flip(-1)) / 2, rtol=1e-3, atol=1e-4)
 
 
 def test_examples_that_are_all_the_same_have_coordinates_of_0():

@@ -34,41 +34,41 @@ def fitted(codes, directions, shrinkage=0.0, **how):
 
 def test_directions_of_lighting_shrink_and_discriminative_ones_are_kept():
     codes, told, lit = planted()
-    found = fitted(codes, 3, 1e-6)
-    assert ((told @ found.map).norm(dim=1) > 10).all()  # 1 of identity is 20 times what views move there
-    assert ((lit @ found.map).norm(dim=1) < 0.2).all()
+    result = fitted(codes, 3, 1e-6)
+    assert ((told @ result.map).norm(dim=1) > 10).all()  # 1 of identity is 20 times what views move there
+    assert ((lit @ result.map).norm(dim=1) < 0.2).all()
     every = fitted(codes, SIZE, 1e-6).ratios
     assert len(every) == SIZE
     assert every[:3].min() > 100 > 1 > every[3:].max()
-    torch.testing.assert_close(found.ratios, every[:3])
+    torch.testing.assert_close(result.ratios, every[:3])
 
 
 def test_renderings_of_one_image_differ_by_one_in_every_kept_direction(codes):
-    found = fitted(codes, 5)
-    features = (codes - found.mean) @ found.map
+    result = fitted(codes, 5)
+    features = (codes - result.mean) @ result.map
     within = (features - features.mean(dim=0)).flatten(0, 1)
     values = torch.linalg.eigvalsh(within.T @ within / (IMAGES * (VIEWS - 1)))
     assert values[-5:] == pytest.approx(np.ones(5), abs=2e-3)
     assert values[:-5].abs().max() < 1e-4
-    assert torch.linalg.matrix_rank(found.map, rtol=1e-4) == 5
+    assert torch.linalg.matrix_rank(result.map, rtol=1e-4) == 5
 
 
 def test_at_evenness_one_images_differ_alike_in_every_kept_direction(codes):
     codes = codes.double()
     for evenness in (0.0, 0.5, 1.0):
-        found = fitted(codes.float(), 5, evenness=evenness)
-        features = (codes - found.mean) @ found.map.double()
+        result = fitted(codes.float(), 5, evenness=evenness)
+        features = (codes - result.mean) @ result.map.double()
         within = (features - features.mean(dim=0)).flatten(0, 1)
         total = within.T @ within / (IMAGES * (VIEWS - 1)) + torch.cov(features.mean(0).T, correction=0)
         variances = torch.linalg.eigvalsh(total)[-5:].numpy()
-        expected = (1 + found.ratios.double()) ** (1 - evenness) * 2**evenness
+        expected = (1 + result.ratios.double()) ** (1 - evenness) * 2**evenness
         assert variances == pytest.approx(expected.sort().values.numpy(), rel=1e-3)
 
 
 def test_directions_count_by_how_much_of_them_is_the_images_own(codes):
     spread = Scatter().add(codes)
     plain, weighted = fit_projection(spread, 3, 0.1), fit_projection(spread, 3, 0.1, power=2)
-    matrices = ((found.map.T @ spread.between.float() @ found.map) for found in (plain, weighted))
+    matrices = ((result.map.T @ spread.between.float() @ result.map) for result in (plain, weighted))
     kept, shrunk = (torch.linalg.eigvalsh(matrix).flip(0)[:3] for matrix in matrices)
     own = plain.ratios / (1 + plain.ratios)
     torch.testing.assert_close(shrunk, kept * own**4, rtol=1e-3, atol=1e-5)
@@ -79,9 +79,9 @@ def test_activations_longer_than_the_code_give_features_of_its_size_and_distingu
     code, _, lit = planted(1)
     code = code - code @ lit.T @ lit  # the code itself is distinguished by other images' axes
     both = torch.cat([code, told], dim=2)
-    found = fitted(both, 6, 1e-6, size=SIZE)
-    assert found.map.shape == (2 * SIZE, SIZE)
-    features = (both - found.mean) @ found.map
+    result = fitted(both, 6, 1e-6, size=SIZE)
+    assert result.map.shape == (2 * SIZE, SIZE)
+    features = (both - result.mean) @ result.map
     assert torch.linalg.matrix_rank(features.flatten(0, 1), rtol=1e-4) == 6
     within = (features - features.mean(dim=0)).flatten(0, 1)
     assert torch.linalg.eigvalsh(within.T @ within)[-6:].max() < 1.1 * IMAGES * (VIEWS - 1)
@@ -92,8 +92,8 @@ def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
     generator = torch.Generator().manual_seed(0)
     own = torch.randn(1, 200, 4, generator=generator) * torch.tensor([0.6, 1.2, 1.8, 2.4])
     codes = own + 0.1 * torch.randn(3, 200, 4, generator=generator)
-    found = fitted(codes, 4)
-    features = ((codes - found.mean) @ found.map).flatten(0, 1)
+    result = fitted(codes, 4)
+    features = ((codes - result.mean) @ result.map).flatten(0, 1)
     together = torch.corrcoef(torch.cat([codes.flatten(0, 1), features], dim=1).T)[:4, 4:]
     assert (together.diagonal() > 0.95).all()
     assert (together - torch.diag(together.diagonal())).abs().max() < 0.3
@@ -101,8 +101,8 @@ def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
 
 def test_codes_that_never_move_are_survived_and_too_few_refused():
     codes = torch.zeros(3, 10, 4)
-    found = fitted(codes, 2, 0.1)
-    assert torch.isfinite(found.map).all() and ((codes - found.mean) @ found.map).abs().max() == 0
+    result = fitted(codes, 2, 0.1)
+    assert torch.isfinite(result.map).all() and ((codes - result.mean) @ result.map).abs().max() == 0
     for few in (codes[:1], codes[:, :1]):
         with pytest.raises(ValueError, match="at least 2 views of 2 images"):
             fitted(few, 2, 0.1)
@@ -115,14 +115,14 @@ def test_sums_over_batches_are_those_of_all_at_once(codes):
     apart = codes.double() - codes.double().mean(dim=0)
     within = torch.einsum("vni,vnj->ij", apart, apart) / (codes.shape[1] * (len(codes) - 1))
     between = torch.cov(codes.double().mean(dim=0).T, correction=0)
-    for found in (whole, parts):
-        torch.testing.assert_close(found.within, within, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(found.between, between, rtol=1e-6, atol=1e-9)
+    for result in (whole, parts):
+        torch.testing.assert_close(result.within, within, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(result.between, between, rtol=1e-6, atol=1e-9)
 
 
 def test_mirrored_maps_take_the_mean_of_both_readings_and_all_of_them(codes):
-    found, (own, mirror) = fitted(codes, 3, 0.1), codes[:2]
-    plain, both = Whitening({"geometry": found}), Whitening({"geometry": found}, mirrored=["geometry"])
+    result, (own, mirror) = fitted(codes, 3, 0.1), codes[:2]
+    plain, both = Whitening({"geometry": result}), Whitening({"geometry": result}, mirrored=["geometry"])
     expected = (plain({"geometry": own})["geometry"] + plain({"geometry": mirror})["geometry"]) / 2
     got = both({"geometry": torch.cat([own, mirror], dim=1)})["geometry"]
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
@@ -140,8 +140,10 @@ def test_of_several_maps_each_is_read_again_as_it_was_written(codes, tmp_path, m
     assert again.mirrored == written.mirrored == set(mirrored)
     both = torch.cat([codes[0], codes[1]], dim=1)
     given = {name: both if name in mirrored else codes[0] for name in maps} | {"camera": codes[0]}
-    found = written(given)
-    assert found.keys() == maps.keys() and all(torch.equal(again(given)[name], found[name]) for name in found)
+    result = written(given)
+    assert result.keys() == maps.keys() and all(
+        torch.equal(again(given)[name], result[name]) for name in result
+    )
     assert written.state_dict() == {}  # a model's weights are the same with it and without
 
 

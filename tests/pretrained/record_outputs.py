@@ -32,18 +32,18 @@ def outputs_of(name: str) -> dict[str, np.ndarray]:
     images = pictures_of(name)
     scene = model.decompose(images)
     relit = scene.with_parameters(light=scene.light.flip(0), camera=scene.camera.flip(0))
-    found = {f"code.{key}": value for key, value in model.encode(images).items()}
+    result = {f"code.{key}": value for key, value in model.encode(images).items()}
     # Coordinates of fitted scenes are left out: 60 steps magnify rounding.
-    found |= {f"feature.{key}": value[:, : ENCODED.get(name)] for key, value in model.embed(images).items()}
-    found |= {f"scene.{key}": _thinned(value) for key, value in scene.parameters.items()}
+    result |= {f"feature.{key}": value[:, : ENCODED.get(name)] for key, value in model.embed(images).items()}
+    result |= {f"scene.{key}": _thinned(value) for key, value in scene.parameters.items()}
     for what, one in (("rendered", scene), ("moved", relit)):
         drawn = model.render(one)
         maps = {key: getattr(drawn, key).float() for key in ("image", "depth", "mask")}
-        found |= {f"{what}.{key}": _thinned(value) for key, value in maps.items()}
+        result |= {f"{what}.{key}": _thinned(value) for key, value in maps.items()}
     if model.fitting is not None:
         fitted = model.fit_scenes(images, FIT_STEPS)
-        found |= {f"fitted.{key}": _thinned(value) for key, value in fitted.scene.parameters.items()}
-    return {key: np.ascontiguousarray(value.detach().numpy(), np.float32) for key, value in found.items()}
+        result |= {f"fitted.{key}": _thinned(value) for key, value in fitted.scene.parameters.items()}
+    return {key: np.ascontiguousarray(value.detach().numpy(), np.float32) for key, value in result.items()}
 
 
 def _thinned(value: torch.Tensor) -> torch.Tensor:

@@ -23,10 +23,10 @@ def test_a_shipped_model_gives_its_recorded_outputs(name):
         record.pictures_of(name).numpy()[..., ::8, ::8], expected.pop("pictures"), atol=1e-6,
         err_msg="the generated images have changed, so nothing can be said of the model",
     )  # fmt: skip
-    found = record.outputs_of(name)
-    assert found.keys() == expected.keys()
+    result = record.outputs_of(name)
+    assert result.keys() == expected.keys()
     for key, value in expected.items():
-        assert found[key].shape == value.shape, key
+        assert result[key].shape == value.shape, key
         scale = max(1.0, float(np.abs(value).max()))
-        apart = float(np.abs(found[key] - value).max())
+        apart = float(np.abs(result[key] - value).max())
         assert apart <= LARGEST_DIFFERENCE * scale, f"{key}: {apart:.2g} of {scale:.2g}"

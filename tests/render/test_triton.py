@@ -81,8 +81,8 @@ def test_where_nothing_is_added_repeatable_gradients_are_nothing(generator):
     values = scene(1, 6, 9, generator)
     right = gradients_of(values, "reference", 3)[:2]
     torch.use_deterministic_algorithms(True)
-    found = gradients_of(values, "triton", 3)[:2]
-    for expected, actual in zip(right, found, strict=True):
+    result = gradients_of(values, "triton", 3)[:2]
+    for expected, actual in zip(right, result, strict=True):
         assert (expected == 0).any() and (actual[expected == 0] == 0).all()
         assert_agrees(actual, expected)
 

@@ -33,16 +33,16 @@ def model(request) -> Derenderer:
 def test_features_and_fitted_scenes_hold_further_factors(model, generator):
     images = torch.rand(3, 3, SIZE, SIZE, generator=generator)
     assert {row.name for row in model.factors} == set(model.embed(images))
-    found, start = model.fit_scenes(images, 12), model.decompose(images)
-    assert (found.after < found.before).all()
-    extra = {name for name in found.scene.parameters if name not in ("depth", "albedo", "light", "camera")}
+    result, start = model.fit_scenes(images, 12), model.decompose(images)
+    assert (result.after < result.before).all()
+    extra = {name for name in result.scene.parameters if name not in ("depth", "albedo", "light", "camera")}
     assert extra == ({"environment"} if model.renderer.name == "sh" else {"specular", "haze"})
     for name in extra:
-        moved = (found.scene.extra[name] - start.extra[name]).abs().amax(dim=1)
+        moved = (result.scene.extra[name] - start.extra[name]).abs().amax(dim=1)
         assert (moved > 1e-3).all()
-    model.renderer.check(found.scene)
+    model.renderer.check(result.scene)
     alone = model.fit_scenes(images[1:2], 12).scene
-    assert torch.equal(alone.depth[0], found.scene.depth[1])
+    assert torch.equal(alone.depth[0], result.scene.depth[1])
 
 
 def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generator, tmp_path):

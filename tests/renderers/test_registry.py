@@ -25,9 +25,9 @@ def test_a_model_is_saved_with_its_renderer_and_found_again(name, tmp_path, gene
     model = Derenderer.from_preset("small", seed=0, renderer=name, **TINY)
     config = json.loads((model.save(tmp_path / "m") / CONFIG_FILE).read_text())
     assert config["settings"]["renderer"] == name == model.renderer.name
-    found, images = load(tmp_path / "m"), torch.rand(2, 3, 32, 32, generator=generator)
-    assert [row.name for row in found.factors] == config["factors"] == [row.name for row in model.factors]
-    assert torch.equal(found.reconstruct(images).image, model.eval().reconstruct(images).image)
+    result, images = load(tmp_path / "m"), torch.rand(2, 3, 32, 32, generator=generator)
+    assert [row.name for row in result.factors] == config["factors"] == [row.name for row in model.factors]
+    assert torch.equal(result.reconstruct(images).image, model.eval().reconstruct(images).image)
     with pytest.raises(ValueError, match=r"was made with the renderer .*, not 'unheard-of'"):
         load(tmp_path / "m", renderer="unheard-of")
 

@@ -46,9 +46,9 @@ def test_gradients_of_every_parameter_are_those_of_finite_differences(name, gene
     names, values = zip(*given.parameters.items(), strict=True)
 
     def image(*changed: Tensor) -> Tensor:
-        found = Scene.from_parameters(dict(zip(names, changed, strict=True)))
-        rendering = Rendering(renderer.shade(found, FOV_DEG), found.depth, torch.ones_like(found.depth))
-        return (rendering if renderer.atmosphere is None else renderer.atmosphere(rendering, found)).image
+        result = Scene.from_parameters(dict(zip(names, changed, strict=True)))
+        rendering = Rendering(renderer.shade(result, FOV_DEG), result.depth, torch.ones_like(result.depth))
+        return (rendering if renderer.atmosphere is None else renderer.atmosphere(rendering, result)).image
 
     assert torch.autograd.gradcheck(image, [value.clone().requires_grad_() for value in values], atol=1e-4)
 
@@ -110,9 +110,9 @@ def flat(light: list[float], yaw: float = 0.0, side: int = 9, **extra: Tensor) -
 def test_a_highlight_has_blinns_closed_form_and_moves_with_the_view(light_yaw, camera_yaw):
     gloss = torch.tensor([[0.4, 20.0]], dtype=torch.float64)
     given = flat([0.2, 0.7, 0.0, light_yaw], camera_yaw, specular=gloss)
-    found = highlight(given, normals_from_depth(given.depth, FOV_DEG), FOV_DEG)[0, 0, 4, 4]
+    result = highlight(given, normals_from_depth(given.depth, FOV_DEG), FOV_DEG)[0, 0, 4, 4]
     half = (light_yaw - camera_yaw) / 2  # the object turns: its own frame sees the camera turn the other way
-    assert float(found) == pytest.approx(0.4 * 0.7 * math.cos(half) ** 20, rel=1e-9)
+    assert float(result) == pytest.approx(0.4 * 0.7 * math.cos(half) ** 20, rel=1e-9)
 
 
 def test_a_highlight_is_only_where_light_falls(generator):
@@ -161,7 +161,7 @@ def bumps(generator, side: int = 40) -> Tensor:
 def test_shadows_are_those_of_a_ray_cast_outside_the_soft_edge(generator):
     depth = bumps(generator)
     light = torch.tensor([[0.3, 0.7, 0, 1.1], [0.3, 0.7, 0.9, 0], [0.3, 0.7, -0.6, -0.9], [0.3, 0.7, 0, 0]])
-    towards, found = -light_direction(light.double()), visible(depth, light.double(), FOV_DEG, 5.0)
+    towards, result = -light_direction(light.double()), visible(depth, light.double(), FOV_DEG, 5.0)
     places = torch.ones_like(depth).nonzero(as_tuple=True)
     lowest = torch.ones(depth.numel()).double()
     for pixels in np.arange(0.1, 60, 0.1):  # fractions of the march's steps: k + k^2 / 12 = pixels
@@ -169,10 +169,10 @@ def test_shadows_are_those_of_a_ray_cast_outside_the_soft_edge(generator):
         lowest = torch.minimum(lowest, clearance(depth, towards, places, step, focal_px(40, FOV_DEG)))
     lowest = lowest.view_as(depth)
     dark, lit = lowest < -math.tan(math.radians(7)), lowest > 0
-    assert 0.02 < dark.double().mean() < 0.6 and (found[3] == 1).all()  # a frontal light casts none
-    assert (found[lit] == 1).all()
-    assert (found[dark] < 0.02).double().mean() > 0.99
-    assert ((found > 0) & (found < 1)).any()
+    assert 0.02 < dark.double().mean() < 0.6 and (result[3] == 1).all()  # a frontal light casts none
+    assert (result[lit] == 1).all()
+    assert (result[dark] < 0.02).double().mean() > 0.99
+    assert ((result > 0) & (result < 1)).any()
 
 
 def test_a_surface_that_bulges_shades_itself_nowhere():
@@ -223,11 +223,11 @@ def test_harmonics_are_orthonormal_and_meet_a_lamp(generator):
 
 def test_environments_are_bounded_and_give_way_to_a_lamp(generator):
     raw = 2 * torch.rand(50, 27, generator=generator) - 1
-    found = environment.bounded(raw, (0.1, 1.25)).view(50, 3, 9)
-    mean = found[..., 0] * environment.MEAN
+    result = environment.bounded(raw, (0.1, 1.25)).view(50, 3, 9)
+    mean = result[..., 0] * environment.MEAN
     assert mean.min() >= 0.1 and mean.max() <= 1.25
     for orders, limit in zip((slice(1, 4), slice(4, 9)), environment.LIMITS, strict=True):
-        assert (found[..., orders].norm(dim=-1) <= limit * found[..., 0] * (1 + 1e-5)).all()
+        assert (result[..., orders].norm(dim=-1) <= limit * result[..., 0] * (1 + 1e-5)).all()
     given = scene_for("sh", generator)
     other = given.with_parameters(environment=given.extra["environment"].flip(0))
     assert_agrees(other.light, given.light.flip(0), "its main light")

@@ -35,10 +35,10 @@ def pictures() -> ImageSet:
 def test_everything_that_can_be_told_is_told_and_escaped(model, pictures, tmp_path):
     pytest.importorskip("captum")
     done = []
-    found = gather(Subject(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
-    assert list(found.sections) == ["data", "decomposed", "films", "scores", "card", "explained"]
-    assert found.failed == [] and done == [(step, 6) for step in range(7)]
-    html = run_page(start_run(tmp_path / "run", resolve("small"), {}, "cpu").path, found).html()
+    result = gather(Subject(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
+    assert list(result.sections) == ["data", "decomposed", "films", "scores", "card", "explained"]
+    assert result.failed == [] and done == [(step, 6) for step in range(7)]
+    html = run_page(start_run(tmp_path / "run", resolve("small"), {}, "cpu").path, result).html()
     assert "<script>.png" not in html and "&lt;script&gt;.png" in html
     for told in ("All of them", "mean image", "no exact depth", "shuffled labels", "tone", "Swap test"):
         assert told in html

@@ -16,8 +16,8 @@ def test_tables_say_what_was_learned_tested_and_lost():
     rows = with_verdicts([row("albedo", False, 0.7, (0.9, 0.5)), row("majority", True, 0.25, (0.25, 0.25))])
     curve = CurveResult("yaw", "camera yaw", (0.0, 40.0), (8, 8, 16), {"accuracy": rows})
     how = ("identity of generated faces", "classes", ("a", "b"), "logistic", {"yaw": 19}, 3, (0, 1))
-    found = RobustnessComparison((curve,), *how)
-    area, curve, _ = found.tables()
+    result = RobustnessComparison((curve,), *how)
+    area, curve, _ = result.tables()
     assert area.caption == (
         "camera yaw, 0 to 40 degrees: accuracy of 2 classes, identity of generated faces; logistic probes on "
         "19 images, 8 to 16 tested, 2 seeds; 3 images without label left out"

@@ -38,9 +38,9 @@ def test_the_albedo_gets_its_brightness_back_and_the_rendering_stays(skins):
     predicted = dimmed(truth, luminance)
     prior = BrightnessPrior.of(brightness_cues(predicted))
     shared = prior(predicted)
-    found = brightness_cues(shared)[:, 0].exp()
-    assert torch.corrcoef(torch.stack([found, luminance]))[0, 1] > 0.97
-    slope = ((found - found.mean()) * (luminance - luminance.mean())).mean() / luminance.var()
+    result = brightness_cues(shared)[:, 0].exp()
+    assert torch.corrcoef(torch.stack([result, luminance]))[0, 1] > 0.97
+    slope = ((result - result.mean()) * (luminance - luminance.mean())).mean() / luminance.var()
     assert 0.8 < slope < 1.2
     light = brightness_cues(shared)[:, 1]
     assert abs(torch.corrcoef(torch.stack([light, luminance]))[0, 1]) < 0.2

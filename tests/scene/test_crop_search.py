@@ -42,9 +42,9 @@ def laid_in(faces_known) -> torch.Tensor:
 
 
 def test_the_part_that_holds_what_the_model_knows_is_found(model, laid_in):
-    found = [best_crop(model, one[None])[1] for one in laid_in]
-    assert len(found) == 3 and all(abs(one.side - 0.7) < 0.11 for one in found)
-    assert all(abs(one.across - 0.1) + abs(one.down - 0.2) < 0.21 for one in found)
+    results = [best_crop(model, one[None])[1] for one in laid_in]
+    assert len(results) == 3 and all(abs(one.side - 0.7) < 0.11 for one in results)
+    assert all(abs(one.across - 0.1) + abs(one.down - 0.2) < 0.21 for one in results)
 
 
 def test_what_the_model_knows_as_it_is_stays_whole(model, faces_known):
@@ -56,12 +56,12 @@ def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
     pictures = bytes_.float() / 255
     with torch.inference_mode():
         seen = model.reconstruct(pictures)
-    (found,) = crop_errors(model, bytes_, [WHOLE], batch_size=3)
+    (result,) = crop_errors(model, bytes_, [WHOLE], batch_size=3)
     for row in range(3):
         inside = seen.mask[row] > 0
         target, drawn = pictures[row][:, inside].numpy(), seen.image[row][:, inside].numpy()
         variance = ((target - target.mean(axis=1, keepdims=True)) ** 2).sum()
-        assert found[row] == pytest.approx(((target - drawn) ** 2).sum() / variance, rel=1e-3)
+        assert result[row] == pytest.approx(((target - drawn) ** 2).sum() / variance, rel=1e-3)
 
 
 def test_a_plain_picture_and_one_with_nothing_in_it_have_an_answer(model, monkeypatch):

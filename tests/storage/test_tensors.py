@@ -15,10 +15,10 @@ def test_packed_numbers_are_off_by_half_a_unit_of_their_slice_at_most(tmp_path, 
     value *= torch.logspace(-6, 3, value.shape[along]).unsqueeze(1 - along)
     bytes_, unit = packed(value, along)
     write_tensors({"map": bytes_, f"map{UNIT}": unit, "mean": value[0]}, tmp_path / "t.safetensors")
-    found = read_tensors(tmp_path / "t.safetensors")
-    assert set(found) == {"map", "mean"} and found["map"].dtype == torch.float32
-    assert bool(((found["map"] - value).abs() <= 0.501 * unit).all())
-    assert torch.equal(found["mean"], value[0])
+    result = read_tensors(tmp_path / "t.safetensors")
+    assert set(result) == {"map", "mean"} and result["map"].dtype == torch.float32
+    assert bool(((result["map"] - value).abs() <= 0.501 * unit).all())
+    assert torch.equal(result["mean"], value[0])
 
 
 @pytest.mark.parametrize(

@@ -68,9 +68,9 @@ def main() -> None:
     os.environ["MASTER_PORT"] = sys.argv[3]  # the last command has left its group
     torch.Tensor.float = torch.Tensor.double
     ranks = ranks_of(open_fabric("cpu"))
-    found = {"count": ranks.count, "steps": [largest_difference(own, ranks) for own in (1.0, 0.3)]}
+    result = {"count": ranks.count, "steps": [largest_difference(own, ranks) for own in (1.0, 0.3)]}
     if ranks.first:
-        Path(sys.argv[1]).write_text(json.dumps(found))
+        Path(sys.argv[1]).write_text(json.dumps(result))
     leave()
 
 

@@ -66,10 +66,10 @@ def test_waiting_is_what_was_not_read_ahead(monkeypatch):
         return read(batches, position, *ranks)
 
     def now() -> float:
-        found = clock[0]
+        result = clock[0]
         if len(waited) == 3:
             asked.set()
-        return found
+        return result
 
     monkeypatch.setattr(Batches, "read", slow)
     monkeypatch.setattr(batches_module.time, "perf_counter", now)

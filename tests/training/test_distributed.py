@@ -96,9 +96,9 @@ def told(folder, tmp_path_factory) -> tuple[dict, list[list[str]], Path]:
 
 
 def test_two_processes_have_the_losses_and_gradients_of_one_with_the_whole_batch(told):
-    found = told[0]
-    assert found["count"] == 2
-    for step in found["steps"]:
+    result = told[0]
+    assert result["count"] == 2
+    for step in result["steps"]:
         assert step["loocc"] > 0
         assert step["terms"] < 1e-10, step
         assert step["gradients"] < 1e-9, step

@@ -68,8 +68,8 @@ def test_light_and_camera_keep_their_codes_without_vectors(plain, white, images)
 
 def test_a_last_batch_of_one_image_is_left_out_of_exchanges(plain, images):
     settings = SETTINGS.model_copy(update={"pictures": BATCH_SIZE + 1, "views": 1, "mirrored": False})
-    found = fit_whitening(plain, images, settings, PerturbSettings())
-    assert bool(found.get_buffer("camera_map").isfinite().all())
+    result = fit_whitening(plain, images, settings, PerturbSettings())
+    assert bool(result.get_buffer("camera_map").isfinite().all())
 
 
 @pytest.mark.parametrize("mirrored", [True, False])
@@ -168,9 +168,9 @@ def test_gradients_beside_activations_are_kept_with_the_model(tmp_path, monkeypa
     own = model.without_features().factor_activations("albedo", pixels[:2]).shape[1]
     assert model.whitening.size("albedo") == own + 2 * 4 * 4 and model.whitening.size("geometry") == own
     model.save(tmp_path / "model")
-    found, expected = derender.load(tmp_path / "model").embed(pixels), model.embed(pixels)
+    result, expected = derender.load(tmp_path / "model").embed(pixels), model.embed(pixels)
     for name, value in expected.items():
-        torch.testing.assert_close(found[name], value)
+        torch.testing.assert_close(result[name], value)
     blank = model.whitening.get_buffer("albedo_map").clone()
     blank[own:] = 0
     model.whitening.get_buffer("albedo_map").copy_(blank)

@@ -35,11 +35,11 @@ def pixels() -> np.ndarray:
 
 
 def test_errors_are_those_of_the_evaluation(pixels):
-    found = reconstruction_errors(Darker(), pixels, batch_size=7)
+    result = reconstruction_errors(Darker(), pixels, batch_size=7)
     target = torch.from_numpy(pixels).float() / 255
     rendering = Darker().reconstruct(target)
-    assert found == pytest.approx(reconstruction_scores(rendering.image, target, rendering.mask).l1_each)
-    assert found[0] == pytest.approx(0.2 * target[0, :, :, :16].mean().item())
+    assert result == pytest.approx(reconstruction_scores(rendering.image, target, rendering.mask).l1_each)
+    assert result[0] == pytest.approx(0.2 * target[0, :, :, :16].mean().item())
 
 
 def test_an_image_into_which_nothing_is_rendered_counts_as_infinitely_wrong(pixels):
@@ -80,8 +80,8 @@ def test_a_damaged_file_says_how_to_make_it_again(tmp_path, damage):
 
 def test_known_percentiles():
     held_out = kept.HeldOutErrors(pictures=101, quantiles=list(np.linspace(0.1, 0.2, 101)))
-    found = kept.percentile_of(np.array([0.0, 0.1, 0.15, 0.1985, 0.2, 9.0, np.inf]), held_out)
-    assert found == pytest.approx([0, 0, 50, 98.5, 100, 100, 100])
+    result = kept.percentile_of(np.array([0.0, 0.1, 0.15, 0.1985, 0.2, 9.0, np.inf]), held_out)
+    assert result == pytest.approx([0, 0, 50, 98.5, 100, 100, 100])
 
 
 def test_rendered_faces_are_known_to_the_bundled_model_and_cars_are_not(shared_data):

@@ -79,9 +79,9 @@ def test_a_healthy_scene_raises_nothing_and_every_sign_has_a_failed_one():
 @pytest.mark.parametrize("sign", FAILED_SCENES)
 def test_each_failure_is_found_within_20000_images_but_not_at_once_and_explained(sign):
     assert watch(FAILED_SCENES[sign], 6_000) == {}
-    found = watch(FAILED_SCENES[sign], 20_000)[sign]
-    assert "{" not in found.text and any(character.isdigit() for character in found.text)
-    assert len(found.advice) > 20
+    result = watch(FAILED_SCENES[sign], 20_000)[sign]
+    assert "{" not in result.text and any(character.isdigit() for character in result.text)
+    assert len(result.advice) > 20
 
 
 def test_large_batches_are_given_as_many_updates_not_as_many_images():
@@ -138,12 +138,12 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypa
     monkeypatch.setattr(watching, "SIGNS", tuple(signs))
     result = train(resolve("small", COLLAPSING), generated(200), tmp_path / "run")
     assert result.stopped == "collapse" and result.images < 4_000
-    found = {finding.sign for finding in result.findings if finding.fatal}
-    assert found & {"saturated depth", "torn depth", "view at its bound"}
+    results = {finding.sign for finding in result.findings if finding.fatal}
+    assert results & {"saturated depth", "torn depth", "view at its bound"}
     rows = read_metrics(tmp_path / "run")
     errors = [row["l1"] for row in rows if row["kind"] == "train"]
     assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.56 with torch 2.15
-    assert found <= set(rows[-1])
+    assert results <= set(rows[-1])
 
 
 def test_the_last_good_state_is_kept_whatever_the_interval(tmp_path, monkeypatch):

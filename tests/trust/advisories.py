@@ -115,11 +115,11 @@ def lower_bounds() -> dict[str, Version]:
     """The lowest versions that pyproject.toml allows of what it names."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     texts = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
-    found = {}
+    results = {}
     for wanted in map(Requirement, texts):
         lowest = [Version(one.version) for one in wanted.specifier if one.operator in (">=", "==")]
-        found[canonicalize_name(wanted.name)] = max(lowest)
-    return found
+        results[canonicalize_name(wanted.name)] = max(lowest)
+    return results
 
 
 def versions() -> dict[str, dict[str, Version]]:
@@ -132,33 +132,33 @@ def versions() -> dict[str, dict[str, Version]]:
 
 def page() -> str:
     """The whole page."""
-    day, found = looked_up()
+    day, result = looked_up()
     judged = versions()
     reached = {
-        name: {kind for kind in kinds if found[name].reaching(kinds[kind])} for name, kinds in judged.items()
+        name: {kind for kind in kinds if result[name].reaching(kinds[kind])} for name, kinds in judged.items()
     }
     tested = [name for name in judged if "tested" in reached[name]]
     lowest = [name for name in judged if reached[name] and name not in tested]
-    passed = [name for name in judged if found[name].advisories and not reached[name]]
+    passed = [name for name in judged if result[name].advisories and not reached[name]]
 
     def table(names: list[str], kind: str) -> str:
         """The advisories that reach these packages, and below them why the versions stay."""
         lines = ["| package | advisory | affected | fixed in | what |", "| --- | --- | --- | --- | --- |"]
         for name in names:
             version = judged[name].get(kind)
-            rows = found[name].advisories if version is None else found[name].reaching(version)
+            rows = result[name].advisories if version is None else result[name].reaching(version)
             lines += [one.row(name) for one in rows]
-        lines += [line for name in names if kind for line in ("", f"{name}: {found[name].answer}")]
+        lines += [line for name in names if kind for line in ("", f"{name}: {result[name].answer}")]
         return "\n".join(lines)
 
     lines = [
         f"| {name} | {those.get('tested', '')} | {those.get('lowest', those.get('lowest set', ''))} | "
-        f"{found[name].records or ''} | {found[name].searches} | {found[name].newest or ''} | "
-        f"{found[name].note} |\n"
+        f"{result[name].records or ''} | {result[name].searches} | {result[name].newest or ''} | "
+        f"{result[name].note} |\n"
         for name, those in judged.items()
     ]
     head = PAGE_HEAD.format(
-        day=day, packages=len(judged), searches=sum(found[name].searches for name in judged),
+        day=day, packages=len(judged), searches=sum(result[name].searches for name in judged),
         tested=table(tested, "tested"), lowest=table(lowest, "lowest"), passed=table(passed, ""),
     )  # fmt: skip
     return head + "".join(lines)

@@ -70,8 +70,8 @@ class Found:
 
     def tell(self, more: str = "") -> int:
         """Say what came of it; gives the number of findings."""
-        said = f"{self.target.name}: {self.inputs:,} inputs, {self.accepted:,} read, {len(self.findings)}"
-        print(f"{said} findings, slowest {self.slowest:.2f} s{more}", flush=True)
+        message = f"{self.target.name}: {self.inputs:,} inputs, {self.accepted:,} read, {len(self.findings)}"
+        print(f"{message} findings, slowest {self.slowest:.2f} s{more}", flush=True)
         for kind, example in self.findings.items():
             print(f"  {kind} ({self.times[kind]}): {example}", flush=True)
         return len(self.findings)
@@ -90,20 +90,20 @@ def limited_and_quiet() -> None:
 
 def fuzz(target: Target, inputs: int, number: int) -> Found:
     """Feed a reader whole files, rubbish, and so many generated inputs."""
-    found = Found(target)
+    result = Found(target)
     for whole in target.wholes:
-        if not found.feed(value := target.given(whole)):
-            found.keep("whole", "is refused", value)
-    if target.wholes and not target.made_again and found.feed(target.given(RUBBISH)):
-        found.keep("rubbish", "is read", RUBBISH)
+        if not result.feed(value := target.given(whole)):
+            result.keep("whole", "is refused", value)
+    if target.wholes and not target.made_again and result.feed(target.given(RUBBISH)):
+        result.keep("rubbish", "is read", RUBBISH)
     only = {"phases": [Phase.generate], "suppress_health_check": list(HealthCheck)}
     chosen = settings(max_examples=inputs, deadline=None, database=None, **only)
 
     def one(value: Any) -> None:
-        found.feed(value)
+        result.feed(value)
 
     seed(number)(chosen(given(target.inputs)(one)))()
-    return found
+    return result
 
 
 def run(asked: Namespace) -> int:
@@ -113,8 +113,8 @@ def run(asked: Namespace) -> int:
     with tempfile.TemporaryDirectory() as place:
         for target in targets(Path(place)):
             if asked.only in target.name:
-                found = fuzz(target, max(1, round(asked.inputs * target.share)), asked.seed)
-                total, findings = total + found.inputs, findings + found.tell()
+                result = fuzz(target, max(1, round(asked.inputs * target.share)), asked.seed)
+                total, findings = total + result.inputs, findings + result.tell()
     print(f"{total:,} inputs, {findings} findings")
     return 1 if findings else 0
 

@@ -79,13 +79,13 @@ class Bench:
             return main(arguments)
 
         _, status, usage = os.wait4(start(work, log), 0)
-        code, said = os.waitstatus_to_exitcode(status), log.read_text(errors="replace")
+        code, message = os.waitstatus_to_exitcode(status), log.read_text(errors="replace")
         megabytes = usage.ru_maxrss / 1024
-        wrong = [f"exit code {code} and not {due}: {said[-400:]}"] if code != due else []
-        wrong += [f"a traceback: {said[-1500:]}"] if "Traceback" in said else []
+        wrong = [f"exit code {code} and not {due}: {message[-400:]}"] if code != due else []
+        wrong += [f"a traceback: {message[-1500:]}"] if "Traceback" in message else []
         wrong += [f"{megabytes:,.0f} MB"] if megabytes > MEMORY_LIMIT_MB else []
-        wrong += [f"does not count {counted}: {said[:400]}"] if counted not in said else []
-        wrong += [f"does not name {one}" for one in named_in(said.replace("\\t", " "), named)]
+        wrong += [f"does not count {counted}: {message[:400]}"] if counted not in message else []
+        wrong += [f"does not name {one}" for one in named_in(message.replace("\\t", " "), named)]
         took = time.monotonic() - began
         self.tell(f"{name}: exit code {code}, {took:.0f} s, {megabytes:,.0f} MB", wrong)
 

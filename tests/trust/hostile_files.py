@@ -77,7 +77,7 @@ def odd_pictures() -> dict[str, bytes]:
     animated = {"save_all": True, "append_images": frames[1:]}
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     deep = np.random.default_rng(1).integers(0, 65536, (30, 30)).astype(np.uint16)
-    found = {
+    result = {
         "plain.jpg": encoded(smooth(1), "JPEG"),
         "jpeg named.png": encoded(smooth(2), "JPEG"),
         "png named.jpg": encoded(smooth(3)),
@@ -100,12 +100,12 @@ def odd_pictures() -> dict[str, bytes]:
         "wide.png": encoded(smooth(27, (30_000, 10))),
         "tall.jpg": encoded(smooth(28, (10, 30_000)), "JPEG"),
     }
-    return {**found, **{name: encoded(smooth(40 + row)) for row, name in enumerate(NAMES)}}
+    return {**result, **{name: encoded(smooth(40 + row)) for row, name in enumerate(NAMES)}}
 
 
 def broken_pictures(steps: int = 16) -> dict[str, bytes]:
     """Files that are no usable images, by name; cut off after every ``1/steps`` of five formats."""
-    found = {
+    result = {
         "empty.png": b"",
         "text.jpg": b"this is a letter",
         "page.png": b"<html><script>alert(1)</script></html>",
@@ -124,8 +124,8 @@ def broken_pictures(steps: int = 16) -> dict[str, bytes]:
     whole |= {"tif": encoded(smooth(63, (60, 40)), "TIFF"), "webp": encoded(smooth(64, (90, 70)), "WEBP")}
     for kind, content in whole.items():
         for step in range(1, steps):
-            found[f"cut {step:02d} of {steps}.{kind}"] = content[: len(content) * step // steps]
-    return found
+            result[f"cut {step:02d} of {steps}.{kind}"] = content[: len(content) * step // steps]
+    return result
 
 
 def write_hostile(folder: Path, steps: int = 16) -> Hostile:
@@ -169,7 +169,7 @@ def write_hostile_zip(file: Path) -> Path:
     return file
 
 
-def named_in(said: str, names: tuple[str, ...]) -> list[str]:
+def named_in(message: str, names: tuple[str, ...]) -> list[str]:
     """The names that are not told of; white space within them counts as one space."""
-    flat = " ".join(said.split())
+    flat = " ".join(message.split())
     return [name for name in names if " ".join(name.split()) not in flat]

@@ -231,9 +231,9 @@ class Trial:
 
     def check(self, folder: Path, cause: str, code: int) -> None:
         """After a kill: an ending as promised, no traceback, and nothing half-written on disk."""
-        said = self.log.read_text(errors="replace")
-        if code not in ENDINGS.get(cause, ()) or "Traceback" in said.partition("Exception ignored in")[0]:
-            self.faults.append(f"{self.name} ended by {cause} with exit code {code}: {said[-1500:]}")
+        message = self.log.read_text(errors="replace")
+        if code not in ENDINGS.get(cause, ()) or "Traceback" in message.partition("Exception ignored in")[0]:
+            self.faults.append(f"{self.name} ended by {cause} with exit code {code}: {message[-1500:]}")
         try:
             left_in(folder)
         except (ValueError, OSError) as problem:
@@ -269,9 +269,9 @@ class Trial:
 
     def tell(self) -> None:
         by_cause = ", ".join(f"{cause} {count}" for cause, count in sorted(self.kills.items()))
-        said = f"{self.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
-        said += f"{self.survived} of {self.rounds} runs ended bit-identical to the undisturbed one; "
-        print(f"{said}{len(self.faults)} faults", flush=True)
+        message = f"{self.name}: {self.kills.total()} kills ({by_cause}), {self.writing} while writing; "
+        message += f"{self.survived} of {self.rounds} runs ended bit-identical to the undisturbed one; "
+        print(f"{message}{len(self.faults)} faults", flush=True)
 
     def numbers_told(self) -> dict[str, object]:
         """For ``--json``."""

@@ -34,21 +34,21 @@ under NVIDIA's terms.
 
 def needed(requirements: Iterable[str]) -> dict[str, Distribution | None]:
     """The packages that requirements name and those that these need, by name; None: not installed here."""
-    found: dict[str, Distribution | None] = {}
+    result: dict[str, Distribution | None] = {}
     waiting = [(Requirement(text), ("",)) for text in requirements]
     while waiting:
         wanted, extras = waiting.pop()
         name = canonicalize_name(wanted.name)
         applies = wanted.marker is None or any(wanted.marker.evaluate({"extra": one}) for one in extras)
-        if not applies or (name in found and not wanted.extras):
+        if not applies or (name in result and not wanted.extras):
             continue
         try:
-            found[name] = distribution(name)
+            result[name] = distribution(name)
         except PackageNotFoundError:
-            found[name] = None
+            result[name] = None
             continue
-        waiting += [(Requirement(text), ("", *wanted.extras)) for text in found[name].requires or ()]
-    return found
+        waiting += [(Requirement(text), ("", *wanted.extras)) for text in result[name].requires or ()]
+    return result
 
 
 def licence_of(package: Distribution) -> str:
@@ -72,9 +72,9 @@ def home_of(package: Distribution) -> str:
     return next((one for one in stated if one and one != "UNKNOWN"), "")
 
 
-def table(found: dict[str, Distribution | None]) -> str:
+def table(result: dict[str, Distribution | None]) -> str:
     lines = ["| package | version | licence |", "| --- | --- | --- |"]
-    for name, package in sorted(found.items()):
+    for name, package in sorted(result.items()):
         if package is None:
             lines.append(f"| {name} |  | not installed where this page was made |")
             continue
@@ -98,7 +98,7 @@ def page() -> str:
         "Needed by an extra (`pip install 'derender[view]'` and others)": extras,
         "For development only": only,
     }
-    return PAGE_HEAD + "".join(f"\n## {title}\n\n{table(found)}\n" for title, found in parts.items())
+    return PAGE_HEAD + "".join(f"\n## {title}\n\n{table(result)}\n" for title, result in parts.items())
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def content_of(file: Path) -> bytes:
 
 def left_in(folder: Path) -> dict[str, bytes]:
     """What lies in a folder under final names; raises unless all of it is whole, models load, seals hold."""
-    found = {}
+    results = {}
     for file in sorted(folder.rglob("*")):
         inner = file.relative_to(folder)
         if any(part.startswith(".") or part.endswith(".partial") for part in inner.parts):
@@ -78,8 +78,8 @@ def left_in(folder: Path) -> dict[str, bytes]:
         elif file.is_file() and not APART & set(inner.parts):
             content = content_of(file)
             if file.name not in UNTIMED:
-                found[str(inner)] = content
-    return found
+                results[str(inner)] = content
+    return results
 
 
 def made_material(place: Path, pictures: int) -> dict[str, str]:

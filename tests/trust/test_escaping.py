@@ -32,9 +32,9 @@ EVIL.append("$\\frac$ & ]]>")
 def harmless(page: Page, evil: str) -> None:
     """Look for what a browser could run or fetch."""
     html = page.html()
-    found = Elements(html).found
-    assert [tag for tag, _ in found].count("script") == 1
-    for tag, attributes in found:
+    result = Elements(html).found
+    assert [tag for tag, _ in result].count("script") == 1
+    for tag, attributes in result:
         assert tag not in ("iframe", "object", "embed", "base", "form")
         assert not [name for name in attributes if name.startswith("on")], (tag, attributes)
         places = [attributes[name] or "" for name in ("src", "href") if name in attributes]
@@ -82,8 +82,8 @@ def test_robustness(evil):
     scores = {key: estimate([value - 0.1, value + 0.1], value + drawn) for key, value in named.items()}
     rows = with_verdicts([ScoredRow(evil, False, 2, scores), ScoredRow(f"{evil} 2", True, 2, scores)])
     curve = CurveResult("yaw", evil, (0.0, 40.0), (8, 8, 16), {"accuracy": rows})
-    found = RobustnessComparison((curve,), evil, "classes", (evil, "b"), "logistic", {"yaw": 19}, 3, (0, 1))
-    harmless(robustness_page(found, evil), evil)
+    result = RobustnessComparison((curve,), evil, "classes", (evil, "b"), "logistic", {"yaw": 19}, 3, (0, 1))
+    harmless(robustness_page(result, evil), evil)
 
 
 @pytest.mark.parametrize("evil", EVIL)
@@ -98,8 +98,8 @@ def test_explanation(evil):
     images = ImageSet(np.zeros((1, 3, 8, 8), np.uint8), (evil,), source=evil)
     pair = (evil, evil), pair_parts(features, 0, 1)
     model, clusters = SimpleNamespace(source=evil), cluster_shares(features, np.arange(90) % 2)
-    found = Explained(shares, model, images, task, rows, clusters, pair)
-    harmless(explanation_page(found, share_chart(shares)[0], sheets), evil)
+    result = Explained(shares, model, images, task, rows, clusters, pair)
+    harmless(explanation_page(result, share_chart(shares)[0], sheets), evil)
 
 
 def test_a_name_with_dollars_is_text_and_no_formula():

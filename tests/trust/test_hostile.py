@@ -79,13 +79,13 @@ def test_commands_count_broken_files_and_name_them(hostile, model, tmp_path, cap
     assert "Traceback" not in capsys.readouterr().err
     assert main(["embed", *every, *out, str(tmp_path / "F.parquet")]) == 0
     assert json.loads(told.read_text())["skipped"] == len(hostile.unreadable)
-    said = capsys.readouterr().err
-    assert f"{len(hostile.unreadable)} skipped" in said and said.count("\nskipped ") == 5
+    message = capsys.readouterr().err
+    assert f"{len(hostile.unreadable)} skipped" in message and message.count("\nskipped ") == 5
     broken = tuple(name for name in hostile.unreadable if "bomb" not in name and "cut" not in name)
     files = [str(hostile.folder / name) for name in ("plain.jpg", "one pixel.png", "two\nlines.png", *broken)]
     assert main(["decompose", *files, "--json", str(told), *out, str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("left out ") == 5 and f"and {len(broken) - 5} more (--json names all)" in said
+    message = capsys.readouterr().err
+    assert message.count("left out ") == 5 and f"and {len(broken) - 5} more (--json names all)" in message
     assert json.loads(told.read_text())["refused"].keys() == {str(hostile.folder / name) for name in broken}
     assert len(list((tmp_path / "out").iterdir())) == 3
 
@@ -142,9 +142,9 @@ def test_names_cannot_steer_the_terminal(plain, model, capsys):
     given = ["--model", model, "--device", "cpu", "--out"]
     assert main(["embed", "--data", str(plain), *given, str(plain / "F.parquet")]) == 0
     assert main(["decompose", str(evil), *given, str(plain / "out")]) == 2
-    said = capsys.readouterr()
-    assert "\x1b" not in said.err + said.out and "\x07" not in said.err + said.out
-    assert "\\x1b]0;owned" in said.err
+    message = capsys.readouterr()
+    assert "\x1b" not in message.err + message.out and "\x07" not in message.err + message.out
+    assert "\\x1b]0;owned" in message.err
 
 
 def test_a_damaged_heic_or_one_that_claims_gigapixels_is_one_line_and_takes_no_memory():

@@ -43,10 +43,10 @@ NEEDED = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", Fals
 
 def dangers(tree: ast.AST) -> list[str]:
     """Calls that can run what a file says, with their lines."""
-    found = []
+    results = []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module in NEVER_FROM:
-            found.append(f"{node.lineno}: from {node.module} import")
+            results.append(f"{node.lineno}: from {node.module} import")
         if not isinstance(node, ast.Call):
             continue
         name = ast.unparse(node.func)
@@ -55,23 +55,23 @@ def dangers(tree: ast.AST) -> list[str]:
         if name.endswith("from_pretrained") and "library" in name:
             needed = ("use_safetensors", True)
         if name in NEVER or name.rpartition(".")[2] in NEVER_METHODS:
-            found.append(f"{node.lineno}: {name}")
+            results.append(f"{node.lineno}: {name}")
         elif needed is not None and given.get(needed[0]) is not needed[1]:
-            found.append(f"{node.lineno}: {name} without {needed[0]}={needed[1]}")
+            results.append(f"{node.lineno}: {name} without {needed[0]}={needed[1]}")
         elif given.get("shell") or given.get("trust_remote_code") or given.get("allow_pickle"):
-            found.append(f"{node.lineno}: {name} with shell, trust_remote_code or allow_pickle")
-    return found
+            results.append(f"{node.lineno}: {name} with shell, trust_remote_code or allow_pickle")
+    return results
 
 
 def test_no_source_has_a_call_that_runs_what_a_file_says():
-    found = {}
+    results = {}
     for path in SOURCES:
         name = path.relative_to(PACKAGE).as_posix()
         allowed = BETWEEN_OWN_PROCESSES.get(name, set())
         left = [one for one in dangers(ast.parse(path.read_text())) if one.split(": ")[1] not in allowed]
         if left:
-            found[name] = left
-    assert not found
+            results[name] = left
+    assert not results
 
 
 @pytest.mark.parametrize(

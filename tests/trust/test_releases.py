@@ -51,11 +51,11 @@ def test_a_release_is_small(release):
 
 def test_its_model_gives_the_numbers_it_gave(release):
     """To 1e-3 of the largest: sums in another order change less, another definition changes far more."""
-    found = make.numbers_of(derender.load(release / "model"))
+    result = make.numbers_of(derender.load(release / "model"))
     wanted = expected(release, "model")
-    assert found.keys() == wanted.keys()
+    assert result.keys() == wanted.keys()
     for name, values in wanted.items():
-        actual, values = np.array(found[name]), np.array(values)
+        actual, values = np.array(result[name]), np.array(values)
         assert actual.shape == values.shape and np.abs(values).max() > 0, name
         assert np.abs(actual - values).max() <= 1e-3 * np.abs(values).max(), name
 
@@ -69,15 +69,15 @@ def test_its_model_has_whitening(release):
 
 
 def test_its_feature_table_holds_what_was_written(release):
-    found, wanted = FeatureTable.read(release / "table.parquet"), make.table()
-    assert found.files == wanted.files and dict(found.origin) == dict(wanted.origin)
-    assert list(found.factors) == list(wanted.factors) and list(found.labels) == list(wanted.labels)
+    result, wanted = FeatureTable.read(release / "table.parquet"), make.table()
+    assert result.files == wanted.files and dict(result.origin) == dict(wanted.origin)
+    assert list(result.factors) == list(wanted.factors) and list(result.labels) == list(wanted.labels)
     for name, values in wanted.factors.items():
-        np.testing.assert_array_equal(found.factors[name], values)
+        np.testing.assert_array_equal(result.factors[name], values)
     for name, values in wanted.labels.items():
         there = ~missing(values)
-        np.testing.assert_array_equal(~missing(found.labels[name]), there)
-        assert found.labels[name][there].tolist() == values[there].tolist()
+        np.testing.assert_array_equal(~missing(result.labels[name]), there)
+        assert result.labels[name][there].tolist() == values[there].tolist()
 
 
 def test_its_checkpoint_goes_on(release):

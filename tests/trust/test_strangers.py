@@ -390,6 +390,6 @@ def test_a_table_of_results_cannot_steer_the_terminal(capsys):
     evil = "\x1b]0;owned\x07\x9b2J\r[bold]x[/bold]"
     shown = ScoreTable(f"nearest to {evil}", evil, (Column(evil),), [Row(evil, (evil,))])
     show_scores(shown, None)
-    said = capsys.readouterr().out
-    assert not {"\x1b", "\x07", "\x9b", "\r"} & set(said)
-    assert said.count("[bold]x[/bold]") == 5 and said.count("\\x1b]0;owned") == 5
+    message = capsys.readouterr().out
+    assert not {"\x1b", "\x07", "\x9b", "\r"} & set(message)
+    assert message.count("[bold]x[/bold]") == 5 and message.count("\\x1b]0;owned") == 5

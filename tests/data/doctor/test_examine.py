@@ -16,13 +16,13 @@ def levels(examination) -> dict[str, str]:
 
 
 def test_varied_faces_are_only_few_and_an_examination_can_be_repeated():
-    found, again = (doctor(made.as_set(made.generated("faces")), seed=5) for _ in range(2))
-    assert found.findings == again.findings and found.examples == again.examples
-    assert found.verdict.word == "will struggle"
-    assert found.verdict.because == ("144 distinct images are too few",)
-    assert {name for name, level in levels(found).items() if level != "good"} == {"number"}
-    assert found.mean is not None and found.mean.shape == (3, 64, 64)
-    assert len(found.examples["most typical"]) == 8
+    result, again = (doctor(made.as_set(made.generated("faces")), seed=5) for _ in range(2))
+    assert result.findings == again.findings and result.examples == again.examples
+    assert result.verdict.word == "will struggle"
+    assert result.verdict.because == ("144 distinct images are too few",)
+    assert {name for name, level in levels(result).items() if level != "good"} == {"number"}
+    assert result.mean is not None and result.mean.shape == (3, 64, 64)
+    assert len(result.examples["most typical"]) == 8
 
 
 def test_the_quick_check_of_a_sample_does_not_count_images():
@@ -38,16 +38,16 @@ def test_the_quick_check_of_a_sample_does_not_count_images():
 )  # fmt: skip
 def test_what_has_no_place_in_the_picture_or_no_variety_is_objected_to(kind, expected, numbers):
     make = getattr(made, kind)
-    found = doctor(made.as_set(make(made.generated("faces") if kind == "moved" else 150, numbers)))
-    assert found.verdict.word == "does not suit" and expected.items() <= levels(found).items()
-    assert kind in ("moved", "copies") or "too little in common" in found.verdict.because[0]
+    result = doctor(made.as_set(make(made.generated("faces") if kind == "moved" else 150, numbers)))
+    assert result.verdict.word == "does not suit" and expected.items() <= levels(result).items()
+    assert kind in ("moved", "copies") or "too little in common" in result.verdict.because[0]
 
 
 def test_pairs_of_copies_are_shown(numbers):
-    found = doctor(made.as_set(made.copies(300, numbers)))
-    assert found.values["distinct"].value < 30
-    pairs = found.examples["copies, in pairs"]
-    assert all(found.group[second] == first for first, second in zip(pairs[::2], pairs[1::2], strict=True))
+    result = doctor(made.as_set(made.copies(300, numbers)))
+    assert result.values["distinct"].value < 30
+    pairs = result.examples["copies, in pairs"]
+    assert all(result.group[second] == first for first, second in zip(pairs[::2], pairs[1::2], strict=True))
 
 
 def test_one_view_and_one_light_are_objected_to_and_one_of_them_is_trouble():
@@ -55,8 +55,8 @@ def test_one_view_and_one_light_are_objected_to_and_one_of_them_is_trouble():
     assert both.verdict.word == "does not suit"
     assert set(both.verdict.because) == {"all are seen from the same side", "all are lit alike"}
     for kind, name, other in (("one view", "view", "light"), ("one light", "light", "view")):
-        found = levels(doctor(made.as_set(made.generated(kind))))
-        assert found[name] == "trouble" and found[other] == "good", kind
+        result = levels(doctor(made.as_set(made.generated(kind))))
+        assert result[name] == "trouble" and result[other] == "good", kind
 
 
 def test_a_crop_off_the_middle_is_named_with_its_side():
@@ -68,26 +68,26 @@ def test_a_crop_off_the_middle_is_named_with_its_side():
 
 def test_faces_mixed_with_landscapes_show_the_odd_ones(numbers):
     images = np.concatenate([made.generated("faces"), made.landscapes(20, numbers)])
-    found = doctor(made.as_set(images))
-    assert levels(found)["out-of-distribution"] == "trouble"
-    assert all(row >= 144 for row in found.examples["least typical"])
+    result = doctor(made.as_set(images))
+    assert levels(result)["out-of-distribution"] == "trouble"
+    assert all(row >= 144 for row in result.examples["least typical"])
 
 
 def test_two_kinds_are_objected_to(numbers):
     """Faces, and faces cut in four and put together crosswise: as common a structure at other places."""
     other = np.roll(made.generated("faces"), (32, 32), axis=(2, 3))
-    found = doctor(made.as_set(np.concatenate([made.generated("faces"), other])))
-    assert levels(found)["kinds"] == "objection"
-    assert len(found.examples["one group"]) == len(found.examples["the other group"]) == 8
+    result = doctor(made.as_set(np.concatenate([made.generated("faces"), other])))
+    assert levels(result)["kinds"] == "objection"
+    assert len(result.examples["one group"]) == len(result.examples["the other group"]) == 8
 
 
 @pytest.mark.parametrize("count", [1, 2, 23])
 def test_few_pictures_are_too_few_and_nothing_is_claimed_of_them(count):
-    found = doctor(made.as_set(made.generated("faces")[:count]))
-    assert found.verdict.word == "does not suit"
-    assert found.shared is None and found.mean is None
-    assert levels(found)["the rest"] == "open"
-    assert len(found.examples["all distinct"]) == min(count, 8)
+    result = doctor(made.as_set(made.generated("faces")[:count]))
+    assert result.verdict.word == "does not suit"
+    assert result.shared is None and result.mean is None
+    assert levels(result)["the rest"] == "open"
+    assert len(result.examples["all distinct"]) == min(count, 8)
 
 
 def test_an_objection_needs_certainty():
@@ -115,19 +115,19 @@ def test_black_white_grey_and_empty_pictures_are_named():
     images[:] = images.mean(axis=1, keepdims=True)
     images[:, :, :, :24] = 255
     images[0] = 7
-    found = {finding.name: finding for finding in doctor(made.as_set(images)).findings}
-    assert found["colour"].text == "100 % of the images are grey."
-    assert found["brightness"].level == "trouble"
-    assert "of the images show one brightness only" in found["empty images"].text
+    result = {finding.name: finding for finding in doctor(made.as_set(images)).findings}
+    assert result["colour"].text == "100 % of the images are grey."
+    assert result["brightness"].level == "trouble"
+    assert "of the images show one brightness only" in result["empty images"].text
 
 
 def test_unreadable_files_and_copies_to_the_pixel_are_counted():
     images = np.concatenate([made.generated("faces"), made.generated("faces")[:2]])
     skipped = tuple(Skipped(f"{number}.jpg", "empty file") for number in range(80))
     copies = (Duplicate("00144.png", "00000.png"), Duplicate("00145.png", "00001.png"))
-    found = doctor(made.as_set(images, skipped=skipped, duplicates=copies))
-    by_name = {finding.name: finding for finding in found.findings}
-    assert found.identical == 2 and found.as_json()["near_copies"] == 0
+    result = doctor(made.as_set(images, skipped=skipped, duplicates=copies))
+    by_name = {finding.name: finding for finding in result.findings}
+    assert result.identical == 2 and result.as_json()["near_copies"] == 0
     assert by_name["files"].level == "trouble"
     assert by_name["files"].text == "35 % of the files cannot be read."
     assert "1 % of the images are copies or near copies (2 of 146: 2 to the pixel" in by_name["copies"].text
@@ -136,5 +136,5 @@ def test_unreadable_files_and_copies_to_the_pixel_are_counted():
 @pytest.mark.parametrize("name", ["utkface64", "lfw64", "celeba64", "synface64", "syncar64"])
 def test_the_development_sets_suit_but_for_their_number(name, shared_data):
     path = shared_data(f"data/{name}.zip")
-    found = doctor(read_images(path, 64, limit=400, keep_duplicates=True, workers=1))
-    assert [f.name for f in found.findings if f.level in ("trouble", "objection")] == ["number"]
+    result = doctor(read_images(path, 64, limit=400, keep_duplicates=True, workers=1))
+    assert [f.name for f in result.findings if f.level in ("trouble", "objection")] == ["number"]

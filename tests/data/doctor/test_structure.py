@@ -16,11 +16,11 @@ def test_pixels_know_black_white_grey_and_blank():
     images[0, :, :8] = 0
     images[1, :, :, :16] = 255
     images[2, 0] = 200
-    found = measures.measure_pixels(images)
-    np.testing.assert_allclose(found.clipped, [0.25, 0.5, 0, 0])
-    assert found.colourless.tolist() == [True, True, False, True]
-    assert found.blank.tolist() == [False, False, True, True]
-    np.testing.assert_allclose((found.tiny**2).sum(axis=1), [1, 1, 0, 0], atol=1e-5)
+    result = measures.measure_pixels(images)
+    np.testing.assert_allclose(result.clipped, [0.25, 0.5, 0, 0])
+    assert result.colourless.tolist() == [True, True, False, True]
+    assert result.blank.tolist() == [False, False, True, True]
+    np.testing.assert_allclose((result.tiny**2).sum(axis=1), [1, 1, 0, 0], atol=1e-5)
 
 
 def test_an_edge_lies_in_its_cell_and_orientation():
@@ -101,8 +101,8 @@ def test_near_copies_are_grouped_under_the_first(numbers):
 
 def test_the_jackknife_of_a_mean_is_its_standard_error(numbers):
     values = numbers.normal(size=4800)
-    found = measures.jackknife(lambda rows: float(values[rows].mean()), len(values))
-    assert found.value == values.mean()
-    assert found.error == pytest.approx(1 / np.sqrt(4800), rel=0.6)
+    result = measures.jackknife(lambda rows: float(values[rows].mean()), len(values))
+    assert result.value == values.mean()
+    assert result.error == pytest.approx(1 / np.sqrt(4800), rel=0.6)
     with pytest.raises(ValueError, match="needs 24 rows or more, got 23"):
         measures.jackknife(lambda rows: 0.0, 23)

@@ -71,9 +71,9 @@ def light_of(made) -> np.ndarray:
 
 
 def test_cars_cast_shadows_too():
-    found = made("shadows", cars, CarSettings, 2)
-    assert ((found.effects["visible"] < 0.5) & found.mask).any()
-    assert ((found.effects["visible"] > 0.99) & found.mask).mean() > 0.05
+    result = made("shadows", cars, CarSettings, 2)
+    assert ((result.effects["visible"] < 0.5) & result.mask).any()
+    assert ((result.effects["visible"] > 0.99) & result.mask).mean() > 0.05
 
 
 def test_settings_are_named_and_bounded_and_maps_are_written(tmp_path):

@@ -73,9 +73,9 @@ def test_importance_finds_the_dimension_and_ignores_a_dead_one(method):
     codes = np.concatenate([RNG.standard_normal((ROWS, 3)), np.zeros((ROWS, 1))], axis=1)[:200]
     classes = (codes[:, 2] > 0).astype(np.int64)
     factors = [TrueFactor("number", 5 * codes[:, 1], False), TrueFactor("class", classes, True)]
-    found = importance(codes, factors, method)
-    np.testing.assert_allclose(found.sum(axis=0), 1)
-    assert found[1, 0] > 0.95 and found[2, 1] > 0.9 and (found[3] == 0).all()
+    result = importance(codes, factors, method)
+    np.testing.assert_allclose(result.sum(axis=0), 1)
+    assert result[1, 0] > 0.95 and result[2, 1] > 0.9 and (result[3] == 0).all()
 
 
 def test_dci_of_known_matrices():
@@ -106,10 +106,10 @@ def test_labels_of_a_rendered_set_become_factors_and_others_do_not():
         "identity": np.arange(ROWS).astype(str),
         "age": NUMBERS[:, 2].astype(np.float32),
     }
-    found, left_out = true_factors(labels)
-    assert [factor.name for factor in found] == ["ambient", "camera yaw", "expression"]
-    assert [factor.is_class for factor in found] == [False, False, True]
-    assert found[2].targets.shape == (ROWS, 3) and (found[2].targets.sum(axis=1) == 1).all()
+    result, left_out = true_factors(labels)
+    assert [factor.name for factor in result] == ["ambient", "camera yaw", "expression"]
+    assert [factor.is_class for factor in result] == [False, False, True]
+    assert result[2].targets.shape == (ROWS, 3) and (result[2].targets.sum(axis=1) == 1).all()
     assert left_out.pop("diffuse") == "1 of 600 values are missing"
     assert left_out == {"shift x": "one value for all images", "identity": "600 classes of 600 images"}
     assert true_factors({**labels, "class": np.full(ROWS, "car")})[1]["class"] == "one class only"

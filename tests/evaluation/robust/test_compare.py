@@ -28,8 +28,8 @@ def stack(levels: tuple[float, ...] = LEVELS) -> tuple[Trial, np.ndarray, np.nda
     return Trial(images, task, unit, (curve,), "made up"), who, angle
 
 
-def rows_of(found, score: str = "accuracy") -> dict:
-    return {row.name: row for row in found.curves[0].rows[score]}
+def rows_of(result, score: str = "accuracy") -> dict:
+    return {row.name: row for row in result.curves[0].rows[score]}
 
 
 def test_identity_itself_scores_one_and_the_light_itself_chance():
@@ -39,15 +39,15 @@ def test_identity_itself_scores_one_and_the_light_itself_chance():
     # whoever was learned from stood in a light of his own; then all stand in the same
     light = np.column_stack((np.where(learned, who * 10.0, angle), np.ones(len(who))))
     features = {"truth": [truth], "light": [light]}
-    found = compare_robustness(features, trial, SEEDS, controls=["light"], resample_count=50)
-    rows = rows_of(found)
+    result = compare_robustness(features, trial, SEEDS, controls=["light"], resample_count=50)
+    rows = rows_of(result)
     assert rows["truth"].scores["area"].value == 1 and rows["truth"].scores["ordinary"].value == 1
     assert rows["truth"].versus["area"].above and rows["truth"].versus["area"].value == 0.75
     for level in LEVELS:
         assert rows["light"].scores[f"{level:g} deg"].value == 1 / PEOPLE  # one answer for all of them
     assert rows["light"].scores["area"].value == rows["majority"].scores["area"].value == 1 / PEOPLE
-    assert rows_of(found, "balanced_accuracy")["majority"].scores["area"].value == 1 / PEOPLE
-    assert found.curves[0].n_tested == (40, 40, 40, 40) and found.n_learned == {"light": 32}
+    assert rows_of(result, "balanced_accuracy")["majority"].scores["area"].value == 1 / PEOPLE
+    assert result.curves[0].n_tested == (40, 40, 40, 40) and result.n_learned == {"light": 32}
 
 
 def test_the_area_is_the_known_one():
@@ -63,8 +63,8 @@ def test_nothing_that_is_tested_is_learned():
     trial, who, _ = stack()
     noise = np.random.default_rng(1).normal(size=(len(who), PEOPLE))
     noise[: PEOPLE * EACH] = 5 * np.eye(PEOPLE)[who[: PEOPLE * EACH]]
-    found = compare_robustness({"noise": [noise]}, trial, (0,), resample_count=20)
-    assert rows_of(found)["noise"].scores["area"].value < 0.5
+    result = compare_robustness({"noise": [noise]}, trial, (0,), resample_count=20)
+    assert rows_of(result)["noise"].scores["area"].value < 0.5
     with pytest.raises(ValueError, match="40 units would be both learned from and tested"):
         Trial(trial.images, trial.task, trial.unit % 40, trial.curves, "made up")
 
@@ -88,8 +88,8 @@ def test_what_fades_with_the_angle_has_the_smaller_area():
     noise = np.random.default_rng(0).normal(size=(len(who), PEOPLE))
     fading = angle[:, None] / 60 * noise[trial.unit]  # a face fades in its own way
     faded = {f"{strength}": [np.eye(PEOPLE)[who] + strength * fading] for strength in (0.0, 0.6, 3.0)}
-    found = compare_robustness(faded, trial, (0,), resample_count=20)
-    rows, curve = rows_of(found), found.curves[0]
+    result = compare_robustness(faded, trial, (0,), resample_count=20)
+    rows, curve = rows_of(result), result.curves[0]
     areas = [rows[name].scores["area"].value for name in ("0.0", "0.6", "3.0", "majority")]
     assert areas == sorted(areas, reverse=True) and areas[0] == 1 and len(set(areas)) == 4
     shares = curve.values(rows["3.0"])

@@ -90,17 +90,17 @@ def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
     second, told = Memory(tmp_path), []
     options |= {"variants": variants, "seeds": (0, 1)}
     scores = segment(model, data, memory=second, **options, progress=lambda *at: told.append(at))
-    found = scores.result
+    result = scores.result
     assert (second.made, second.recalled) == (3, 1)
     assert told[-1][:2] == (4 * len(data.train),) * 2
     again = segment(model, data, memory=Memory(tmp_path), **options).result
-    for one, two in zip(found.rows, again.rows, strict=True):
+    for one, two in zip(result.rows, again.rows, strict=True):
         assert str(one.scored.numbers()["scores"]) == str(two.scored.numbers()["scores"])
         assert (one.shown == two.shown).all() and (one.losses == two.losses).all()
-    names = [row.scored.name for row in found.rows]
+    names = [row.scored.name for row in result.rows]
     assert names[:2] == ["albedo encoder", "random start"] and "each place's class" in names
-    assert [row.scored.control for row in found.rows] == [False, True, True, True, True, True]
-    assert found.rows[0].scored.runs == 2 and found.rows[0].losses.shape == (2, 1)
+    assert [row.scored.control for row in result.rows] == [False, True, True, True, True, True]
+    assert result.rows[0].scored.runs == 2 and result.rows[0].losses.shape == (2, 1)
     shares = scores.values["test_share"]
     assert sum(shares.values()) == pytest.approx(1) and shares["nothing"] == 0
     changed = Memory(tmp_path)
@@ -154,23 +154,23 @@ def test_a_class_that_no_mask_shows_is_left_out_for_every_answer():
     masks = np.array([[[0, 0], [1, 1]]], np.uint8)
     right, wrong = masks.copy(), np.array([[[0, 3], [1, 1]]], np.uint8)
     assert scores(right, masks).mean_iou == 1
-    found = scores(wrong, masks)
-    assert found.class_iou == pytest.approx([0.5, 1, np.nan, np.nan], nan_ok=True)
-    assert found.mean_iou == 0.75 == found.top10_iou
+    result = scores(wrong, masks)
+    assert result.class_iou == pytest.approx([0.5, 1, np.nan, np.nan], nan_ok=True)
+    assert result.mean_iou == 0.75 == result.top10_iou
 
 
 def test_they_are_torchmetrics_own():
     random = np.random.default_rng(0)
     masks = random.integers(0, 19, (70, 6, 5)).astype(np.uint8)
     answers = np.where(random.random(masks.shape) < 0.5, masks, random.integers(0, 19, masks.shape))
-    found = scores(answers.astype(np.uint8), masks, 19)
+    result = scores(answers.astype(np.uint8), masks, 19)
     given, truth = torch.from_numpy(answers).long(), torch.from_numpy(masks).long()
     each = multiclass_jaccard_index(given, truth, 19, average="none").numpy()
-    assert found.class_iou == pytest.approx(each, abs=1e-6)
-    assert found.mean_iou == pytest.approx(multiclass_jaccard_index(given, truth, 19).item(), abs=1e-6)
-    assert found.top10_iou == pytest.approx(np.sort(each)[-10:].mean(), abs=1e-6)
+    assert result.class_iou == pytest.approx(each, abs=1e-6)
+    assert result.mean_iou == pytest.approx(multiclass_jaccard_index(given, truth, 19).item(), abs=1e-6)
+    assert result.top10_iou == pytest.approx(np.sort(each)[-10:].mean(), abs=1e-6)
     accuracy = multiclass_accuracy(given, truth, 19, average="micro").item()
-    assert found.pixel_accuracy == pytest.approx(accuracy, abs=1e-6)
+    assert result.pixel_accuracy == pytest.approx(accuracy, abs=1e-6)
 
 
 def test_resamples_are_scores_of_the_pictures_drawn_with_the_same_ten_classes():
@@ -179,6 +179,6 @@ def test_resamples_are_scores_of_the_pictures_drawn_with_the_same_ten_classes():
     answers = random.integers(0, 3, masks.shape).astype(np.uint8)
     counts, drawn = count_pixels(answers, masks, 4), [0, 0, 3, 5]
     weights = np.bincount(drawn, minlength=6)[None]
-    found = scores(answers[drawn], masks[drawn])
-    expected = [found.mean_iou, found.mean_iou, found.pixel_accuracy]
+    result = scores(answers[drawn], masks[drawn])
+    expected = [result.mean_iou, result.mean_iou, result.pixel_accuracy]
     assert resampled_scores(counts, weights)[0] == pytest.approx(expected)

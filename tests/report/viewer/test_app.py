@@ -38,17 +38,17 @@ def test_about_says_what_there_is(client):
 
 
 def test_a_picture_is_taken_apart_and_shown(client):
-    found = client.opened(0)
-    assert (found["width"], found["height"], found["framed"], found["faces"]) == (48, 40, "none", [])
-    assert found["crop"] == {"x": 24, "y": 20, "side": 40, "roll_deg": 0}
-    assert 0 < found["l1"] < 1 and found["percentile"] is None and found["out_of_distribution"] is False
-    assert found["l1_feed_forward"] is None
-    own = client.post("/api/view", {"picture": found["picture"]})
+    result = client.opened(0)
+    assert (result["width"], result["height"], result["framed"], result["faces"]) == (48, 40, "none", [])
+    assert result["crop"] == {"x": 24, "y": 20, "side": 40, "roll_deg": 0}
+    assert 0 < result["l1"] < 1 and result["percentile"] is None and result["out_of_distribution"] is False
+    assert result["l1_feed_forward"] is None
+    own = client.post("/api/view", {"picture": result["picture"]})
     assert (own.status, own.headers["content-type"]) == (200, "image/jpeg")
     assert own.image.shape == (27, 32, 4)  # the part around the crop: here all of the photograph
-    before = client.post("/api/before", {"picture": found["picture"]}).image
+    before = client.post("/api/before", {"picture": result["picture"]}).image
     assert np.abs(own.image.astype(int) - before).mean() < 2  # its own light and view give it back
-    again = client.post("/api/view", {key: found[key] for key in ("picture", "light", "camera")})
+    again = client.post("/api/view", {key: result[key] for key in ("picture", "light", "camera")})
     assert np.abs(again.image.astype(int) - own.image).max() <= 4  # degrees and back, as JPEG
 
 
@@ -198,15 +198,15 @@ def test_a_wider_picture_is_shown_in_the_part_that_the_model_knows():
     left, top, side = Crop(0.5, 0.0, 0.2).corner(128)
     wide[top : top + side, left : left + side] = face
     framed, whole = Studio(model, "faces", frame="auto"), Studio(model, "faces")
-    found = framed.open(wide)
+    result = framed.open(wide)
     crop = {"x": left + side / 2, "y": top + side / 2, "side": side, "roll_deg": 0}
-    assert found["crop"] == crop
-    np.testing.assert_array_equal(framed.shelf.get(found["picture"]).pixels, face.transpose(2, 0, 1))
-    assert found["l1"] == pytest.approx(whole.open(face)["l1"])
+    assert result["crop"] == crop
+    np.testing.assert_array_equal(framed.shelf.get(result["picture"]).pixels, face.transpose(2, 0, 1))
+    assert result["l1"] == pytest.approx(whole.open(face)["l1"])
     assert framed.open(face)["crop"]["side"] == 64  # of the model's own size: as it is
 
     own = whole.again(CropRequest(picture=whole.open(wide)["picture"], crop=Place(**crop)))
-    assert (own["framed"], own["l1"]) == ("own", found["l1"])
+    assert (own["framed"], own["l1"]) == ("own", result["l1"])
     beyond = whole.again(CropRequest(picture=own["picture"], crop=Place(x=1e6, y=1e6, side=1e7)))
     assert beyond["crop"]["side"] <= 256 and beyond["crop"]["x"] <= 128
 
@@ -217,10 +217,10 @@ def test_every_face_is_offered_and_the_largest_is_taken():
     photo[22:278, 280:536] = large
     photo[80:208, 60:188] = large[::2, ::2]
     studio = Studio(load("faces-64"), "faces")
-    found = studio.open(photo)
-    assert found["framed"] == "face" and len(found["faces"]) == 2
-    assert found["crop"] == found["faces"][0] and found["crop"]["x"] > 280 > found["faces"][1]["x"]
-    asked = ViewRequest(picture=found["picture"], light=Light(**LIGHT | {"yaw_deg": 60.0}))
+    result = studio.open(photo)
+    assert result["framed"] == "face" and len(result["faces"]) == 2
+    assert result["crop"] == result["faces"][0] and result["crop"]["x"] > 280 > result["faces"][1]["x"]
+    asked = ViewRequest(picture=result["picture"], light=Light(**LIGHT | {"yaw_deg": 60.0}))
     edited = np.asarray(Image.open(io.BytesIO(studio.picture(asked))))
     changed = np.abs(edited.astype(int) - photo).max(axis=-1) > 8
     assert edited.shape == photo.shape and changed[:, 280:].mean() > 0.2 and not changed[:, :150].any()
@@ -264,8 +264,8 @@ def test_a_model_of_wider_ranges_than_the_page_has_opens_at_its_bounds():
     for name in ("light", "camera"):
         model.nets[name].decoder.linear.weight.data *= 1e4
     studio = Studio(model.eval().requires_grad_(False), "wide")
-    found = studio.open(np.full((64, 64, 3), 99, np.uint8))
-    assert found["light"]["ambient"] == 2 and abs(found["light"]["yaw_deg"]) == 89
-    assert {abs(one) for one in found["camera"]["rotation_deg"]} == {89}
-    assert studio.view(ViewRequest(**{name: found[name] for name in ("picture", "light", "camera")}))
+    result = studio.open(np.full((64, 64, 3), 99, np.uint8))
+    assert result["light"]["ambient"] == 2 and abs(result["light"]["yaw_deg"]) == 89
+    assert {abs(one) for one in result["camera"]["rotation_deg"]} == {89}
+    assert studio.view(ViewRequest(**{name: result[name] for name in ("picture", "light", "camera")}))
     assert Light.of(torch.tensor([torch.nan, -1, 0, torch.nan])).ambient == 0

@@ -17,8 +17,8 @@ def test_rendered_examples_are_known_to_the_model_and_differ(model):
     stacked = np.stack([np.asarray(example.thumbnail(64)) for example in examples]).transpose(0, 3, 1, 2)
     net, errors = load(model), read_errors(model_folder(model))
     assert errors is not None
-    found = reconstruction_percentile(net, stacked, errors)
-    assert (found <= OUTLIER_PERCENTILE).all() and np.median(found) < 80
+    result = reconstruction_percentile(net, stacked, errors)
+    assert (result <= OUTLIER_PERCENTILE).all() and np.median(result) < 80
 
 
 def test_every_bundled_model_has_examples_and_others_have_none(tmp_path):

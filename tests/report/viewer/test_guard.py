@@ -31,8 +31,8 @@ def refusal(method: str, path: str, **headers: str) -> int | None:
     async def nothing(scope, receive, send):
         raise AssertionError("not to be called")
 
-    found = Guard(nothing, "127.0.0.1").refusal(method, path, Headers({"host": "localhost:1", **headers}))
-    return None if found is None else found[0]
+    result = Guard(nothing, "127.0.0.1").refusal(method, path, Headers({"host": "localhost:1", **headers}))
+    return None if result is None else result[0]
 
 
 def test_which_requests_pass():

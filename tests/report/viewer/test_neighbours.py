@@ -33,13 +33,13 @@ def test_neighbours_of_a_picture_of_the_table(model, folder, table, client):
             "rows": 6, "factors": ["geometry", "albedo", "light", "camera"], "note": "",
         }  # fmt: skip
         name = visitor.post("/api/pictures", (folder / "3.png").read_bytes()).json["picture"]
-        found = visitor.post("/api/neighbours", {"picture": name, "factor": "albedo", "k": 3}).json["rows"]
+        result = visitor.post("/api/neighbours", {"picture": name, "factor": "albedo", "k": 3}).json["rows"]
         rows = table.factors["albedo"]
         (first,), (away,) = nearest(table, rows[3], "albedo", 1, exclude=[3])  # itself is no neighbour
-        assert [found[0]["row"], found[0]["file"]] == [first, f"{first}.png"]
-        assert found[0]["distance"] == pytest.approx(away, abs=1e-5)
-        assert [row["distance"] for row in found] == sorted(row["distance"] for row in found)
-        assert all(row["image"].startswith("data:image/png;base64,") for row in found)
+        assert [result[0]["row"], result[0]["file"]] == [first, f"{first}.png"]
+        assert result[0]["distance"] == pytest.approx(away, abs=1e-5)
+        assert [row["distance"] for row in result] == sorted(row["distance"] for row in result)
+        assert all(row["image"].startswith("data:image/png;base64,") for row in result)
         other = visitor.post("/api/rows/4").json["picture"]
         asked = {"picture": name, "swaps": {"albedo": other}, "factor": "albedo", "k": 1}
         (second,), _ = nearest(table, rows[4], "albedo", 1, exclude=[4])

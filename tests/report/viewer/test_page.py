@@ -32,14 +32,14 @@ def test_text_never_becomes_html(name):
 
 
 def test_what_is_shown_and_what_is_pressed_has_a_name():
-    found = Elements(PAGE["index.html"]).found
-    for tag, attributes in found:
+    result = Elements(PAGE["index.html"]).found
+    for tag, attributes in result:
         if tag == "img":
             assert "alt" in attributes
         if tag == "canvas":
             assert attributes["aria-label"]
-    identifiers = [attributes["id"] for _, attributes in found if "id" in attributes]
+    identifiers = [attributes["id"] for _, attributes in result if "id" in attributes]
     assert len(identifiers) == len(set(identifiers))
     asked = set(re.findall(r'\$\("([\w-]+)"\)', PAGE["view.js"]))
     assert asked <= set(identifiers)
-    assert any(tag == "html" and attributes["lang"] == "en" for tag, attributes in found)
+    assert any(tag == "html" and attributes["lang"] == "en" for tag, attributes in result)

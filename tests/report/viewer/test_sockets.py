@@ -32,13 +32,13 @@ def head(url: str, path: str = "/api/pictures", more: str = "") -> bytes:
 def answered(connection: socket.socket) -> bytes:
     """Everything until the server ends the connection or says no more for a second."""
     connection.settimeout(1)
-    found = b""
+    result = b""
     try:
         while part := connection.recv(65536):
-            found += part
+            result += part
     except (TimeoutError, ConnectionResetError):
         pass
-    return found
+    return result
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -133,10 +133,10 @@ def test_what_follows_a_short_body_is_a_request_of_its_own_and_has_to_prove_itse
     smuggled = b"POST /api/examples/0 HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 0\r\n\r\n"
     with connected(client.url) as connection:
         connection.sendall(head(client.url, "/api/view", "Content-Length: 2\r\n") + b"{}" + smuggled)
-        found = answered(connection)
-    assert found.count(b"HTTP/1.1 ") == 2
-    assert b" 422 " in found or b" 400 " in found
-    assert b" 421 " in found
+        result = answered(connection)
+    assert result.count(b"HTTP/1.1 ") == 2
+    assert b" 422 " in result or b" 400 " in result
+    assert b" 421 " in result
 
 
 @pytest.mark.parametrize("more", [CHUNKED + "Content-Length: 4\r\n", "Content-Length: 4\r\n" + CHUNKED])
@@ -147,8 +147,10 @@ def test_a_length_beside_chunks_is_refused_and_nothing_behind_it_is_served(clien
         one = head(client.url, "/api/view", more).replace(b"POST", method.encode())
         other = head(client.url, "/api/view", "Content-Length: 2\r\n") + b"{}"
         connection.sendall(one + b"0\r\n\r\n" + other)
-        found = answered(connection)
-    assert found.count(b"HTTP/1.1 ") == 1 and b" 400 " in found and b"Transfer-Encoding is refused" in found
+        result = answered(connection)
+    assert (
+        result.count(b"HTTP/1.1 ") == 1 and b" 400 " in result and b"Transfer-Encoding is refused" in result
+    )
 
 
 @pytest.mark.parametrize(
@@ -163,10 +165,10 @@ def test_heads_that_say_two_things_are_refused(client, more):
     with connected(client.url) as connection:
         try:
             connection.sendall(head(client.url, "/api/view", more) + b"{}")
-            found = answered(connection)
+            result = answered(connection)
         except ConnectionError:
-            found = b"HTTP/1.1 400 "
-    assert found.split(b" ")[1] in (b"400", b"421", b"422"), found[:200]
+            result = b"HTTP/1.1 400 "
+    assert result.split(b" ")[1] in (b"400", b"421", b"422"), result[:200]
     assert client.get("/api/about").status == 200
 
 
@@ -174,8 +176,8 @@ def test_broken_chunks_are_refused(client):
     for chunk in (b"zz\r\nab\r\n0\r\n\r\n", b"-1\r\nab\r\n", b"fffffffffffffffffffff\r\nab"):
         with connected(client.url) as connection:
             connection.sendall(head(client.url, "/api/view", CHUNKED) + chunk)
-            found = answered(connection)
-        assert b" 200 " not in found
+            result = answered(connection)
+        assert b" 200 " not in result
     assert client.get("/api/about").status == 200
 
 

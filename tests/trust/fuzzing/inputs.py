@@ -47,13 +47,13 @@ def encoded_pictures() -> list[bytes]:
     noise = np.random.default_rng(0).integers(0, 256, (9, 11, 3), dtype=np.uint8)
     picture, deep = Image.fromarray(noise), Image.fromarray(noise[..., 0].astype(np.uint16) * 257)
     plain = [(form, picture) for form in ("JPEG", "PNG", "WEBP", "BMP", "GIF", "TIFF", "PPM")]
-    found = []
+    results = []
     for form, one in (*plain, ("PNG", deep), ("TIFF", deep)):
         stream = io.BytesIO()
         more = {"save_all": True, "append_images": [picture.rotate(90)]} if form == "GIF" else {}
         one.save(stream, format=form, **more)
-        found.append(stream.getvalue())
-    return found
+        results.append(stream.getvalue())
+    return results
 
 
 def packed(kind: int) -> bytes:

@@ -37,11 +37,11 @@ PLACES = (5, 16, 27)
 def pictures(count: int = 2) -> torch.Tensor:
     """(N, 3, 32, 32) in 0..1: waves of different lengths, rounded to bytes, so the same everywhere."""
     y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE
-    found = [
+    results = [
         [np.sin((3 + number + channel) * x + (2 + channel) * y + number) for channel in range(3)]
         for number in range(count)
     ]
-    return torch.from_numpy(np.round(127.5 + 120 * np.array(found)).astype(np.uint8)).float() / 255
+    return torch.from_numpy(np.round(127.5 + 120 * np.array(results)).astype(np.uint8)).float() / 255
 
 
 def numbers_of(model: Derenderer) -> dict[str, list]:
@@ -51,10 +51,10 @@ def numbers_of(model: Derenderer) -> dict[str, list]:
         image = model.render(scene).image
     at = np.ix_(PLACES, PLACES)
     maps = {"depth": scene.depth[:, None], "albedo": scene.albedo, "image": image}
-    found = {f"feature {name}": value for name, value in features.items()}
-    found |= {"light": scene.light, "camera": scene.camera}
-    found |= {name: torch.stack([one[..., at[0], at[1]] for one in value]) for name, value in maps.items()}
-    return {name: value.double().numpy().round(7).tolist() for name, value in found.items()}
+    result = {f"feature {name}": value for name, value in features.items()}
+    result |= {"light": scene.light, "camera": scene.camera}
+    result |= {name: torch.stack([one[..., at[0], at[1]] for one in value]) for name, value in maps.items()}
+    return {name: value.double().numpy().round(7).tolist() for name, value in result.items()}
 
 
 def table() -> FeatureTable:
