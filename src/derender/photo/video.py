@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from derender.model import Derenderer
-from derender.photo.edit import Photograph, found_frame
+from derender.photo.edit import Photograph, editable_scenes, found_frame
 from derender.photo.faces import UTKFACE, find_faces, frame_of, template_of
 from derender.photo.frame import Frame
 from derender.scene import Scene
@@ -56,7 +56,7 @@ class EditedVideo:
 
 def edit_video(
     video: str | Path, out: str | Path, model: Derenderer, edit: Edit, *, frame: str | None = None,
-    progress: Callable[..., object] | None = None,
+    fit_steps: int | None = None, progress: Callable[..., object] | None = None,
 ) -> EditedVideo:  # fmt: skip
     """Edit every frame of a video, and write it as MP4 with its sound.
 
@@ -65,6 +65,7 @@ def edit_video(
         out: the .mp4 to write.
         model: trained.
         edit: gives new parameters for the scenes of all frames.
+        fit_steps: as `editable_scenes` takes them.
         frame: "face", the default of models of faces, or "none", the middle square.
         progress: called with (frames done, frames in all) and what is being done as ``description``.
 
@@ -97,7 +98,7 @@ def edit_video(
         cuts.append(frames[number].cut(pixels, model.image_size))
         if len(cuts) == BATCH or number == count - 1:
             images = torch.from_numpy(np.stack(cuts)).to(model.device).float() / 255
-            scenes.append(model.decompose(images).detach())
+            scenes.append(editable_scenes(model, images, fit_steps).detach())
             cuts = []
         report(number + 1, count, description="decomposing")
     scene = _smooth(Scene.joined(scenes), fps)

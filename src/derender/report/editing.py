@@ -158,8 +158,9 @@ def write_images(
         assert video is not None
         with atomic_folder(places[path]) as temporary:
             film = edit_video(
-                path, temporary / FILM, opener.model, video, frame=opener.options.frame, progress=progress
-            )
+                path, temporary / FILM, opener.model, video, frame=opener.options.frame,
+                fit_steps=opener.options.fit_steps, progress=progress,
+            )  # fmt: skip
             record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
             (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
         records.append(record)
