@@ -44,7 +44,7 @@ COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carri
 RIM_SHARE = 0.04  # of the side: the rim of the model's maps, where depth ends in a wall
 REACH_SHARE = 1 / 4  # of the side: how far the surface goes on around them, at least
 FADE_SHARE = 1 / 3  # reach of new shading around them
-SURE = 0.50  # of half the side: radius within which all is the object
+SURE = 0.65  # of half the side: radius within which all is the object
 LIKELY = (0.80, 0.60)  # of half the side: radius, and column, in which the search for its outline starts
 DARKEST = 1e-3
 LAMBERT = Renderer("lambert")
@@ -83,7 +83,7 @@ class PhotoDetail:
         self.renderer = renderer
         self._shading, self._veil = self._light(own), renderer.veil(own, self.wide_fov)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
-        self._colours, self._object = self._completed(own), self._found_object(own)
+        self._colours, self._object = self._completed(own), self._found_object(own, points)
         at_home = self._warped(self._place, own)
         off = (at_home.image - self._pixels()) * at_home.mask[:, None]
         self._off = off * (off.norm(dim=1, keepdim=True) < 1)  # what rounding leaves; more is hidden surface
@@ -250,14 +250,15 @@ class PhotoDetail:
             _eroded(share, reach), 2 * reach + 1, stride=1, padding=reach, count_include_pad=False
         )
 
-    def _found_object(self, own: Scene) -> Float[Tensor, "1 1 w w"]:
+    def _found_object(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 w w"]:
         """How surely each canonical point is the object and not what is behind it, 0..1."""
         size = self.wide // 2
         photo = self.on_grid(self.photo[None], size, (self.wide - 1) / (self.grid - 1))
         pixels = np.ascontiguousarray((255 * photo[0]).byte().permute(1, 2, 0).cpu().numpy())
         across = (torch.arange(self.wide) - (self.wide - 1) / 2).to(photo) / (self.grid / 2)
         radius, column = torch.hypot(across, across[:, None]), across.abs().expand(self.wide, -1)
-        start = torch.stack((radius < SURE, (radius < LIKELY[0]) | (column < LIKELY[1])))[None].to(photo)
+        sure = (radius < SURE) & (_facing(points)[0] > FACING[1])
+        start = torch.stack((sure, (radius < LIKELY[0]) | (column < LIKELY[1])))[None].to(photo)
         sure, likely = (interpolate(self._warped(start, own).image, (size, size)) > 0.5)[0].cpu().numpy()
         labels = np.select((sure, likely), (cv2.GC_FGD, cv2.GC_PR_FGD), cv2.GC_PR_BGD).astype(np.uint8)
         if sure.any() and not likely.all():
