@@ -41,6 +41,7 @@ def script(name: str) -> ModuleType:
     return module
 
 
+sys.path.insert(0, str(DOCS))  # pages imports its tables from beside it
 pages, reference = script("pages"), script("reference")
 COMMANDS = dict(reference.all_commands())
 

@@ -1,0 +1,326 @@
+"""Tables of results as Markdown, from the files that commands and benchmarks wrote.
+
+A table is one of ``FILES``, each read by a function of its own, or a file of benchmarks/results/tables with
+its columns in it. There a row with ``hidden`` stays in the file.
+"""
+
+import json
+import re
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import speed_tables as speed
+
+RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
+
+
+def table(name: str, keys: list[str] | None = None) -> str:
+    """One table as Markdown, with a note: its file, and data that are not generated."""
+    if name in FILES:
+        file, read = FILES[name]
+        result = json.loads((RESULTS / file).read_text())
+        head, *rows = read(result)
+        lines = [head, ["---"] * len(head), *rows]
+        note = f"`benchmarks/results/{file}`"
+    else:
+        result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
+        lines = [*body(result, keys or [column["key"] for column in result["columns"]])]
+        note = f"`benchmarks/results/tables/{name}.json`"
+        kept = {False: "from its owners", True: "not published"}
+        sets = [
+            f"{re.split(r' at |: |, ', x)[0]} ({kept['not published' in x]})" for x in result.get("needs", ())
+        ]
+        note += "; data: " + ", ".join(sets) if sets else ""
+    shown = "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+    return f"{shown}\n\n{textwrap.fill(f'Source: {note}.', 118, break_on_hyphens=False)}\n"
+
+
+def body(result: Mapping[str, Any], keys: list[str]) -> Iterator[list[str]]:
+    """Rows of cells: the head, the rule, the rows; the best of each column is bold."""
+    columns = {column["key"]: column for column in result["columns"]}
+    rows = [row for row in result["rows"] if not row.get("hidden") and any(key in row for key in keys)]
+    yield ["", *(columns[key]["head"] for key in keys)]
+    yield ["---"] * (len(keys) + 1)
+    best = {key: best_of(columns[key], [row[key] for row in rows if key in row]) for key in keys}
+    for row in rows:
+        cells = [cell(row.get(key), columns[key].get("digits", 0), best[key]) for key in keys]
+        note = " (control)" if row.get("control") and "(control" not in row["name"] else ""
+        yield [row["name"] + note, *cells]
+
+
+def looked_up(reference: re.Match[str]) -> str:
+    """``{table|row|column}`` in a cell: that number, as its own table shows it, without its interval."""
+    name, row, key = reference[1].split("|")
+    if name in FILES:
+        head, *rows = FILES[name][1](json.loads((RESULTS / FILES[name][0]).read_text()))
+        return next(cells for cells in rows if cells[0] == row)[head.index(key)].split(" (")[0]
+    result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
+    digits = next(column["digits"] for column in result["columns"] if column["key"] == key)
+    return cell(value_of(next(one for one in result["rows"] if one["name"] == row)[key]), digits, None)
+
+
+def value_of(entry: Any) -> float:
+    return entry["value"] if isinstance(entry, dict) else entry
+
+
+def best_of(column: Mapping[str, Any], entries: list[Any]) -> float | None:
+    if "best" not in column or not entries:
+        return None
+    return (max if column["best"] == "high" else min)(map(value_of, entries))
+
+
+def cell(entry: Any, digits: int, best: float | None) -> str:
+    """A number with its interval or its standard deviation."""
+    if entry is None:
+        return ""
+    if isinstance(entry, str):
+        return re.sub(r"\{(.+?)\}", looked_up, entry)
+    text = f"{value_of(entry):,.{digits}f}"
+    text = f"**{text}**" if value_of(entry) == best else text
+    if isinstance(entry, dict) and "low" in entry:
+        return f"{text} ({entry['low']:.{digits}f}-{entry['high']:.{digits}f})"
+    return f"{text} ± {entry['spread']:.{digits}f}" if isinstance(entry, dict) and "spread" in entry else text
+
+
+def edits(which: str, angles: dict[str, str]) -> Callable[[Any], Iterator[list[str]]]:
+    """PSNR and SSIM of edited photographs by angle."""
+    names = {
+        "derender": "derender, photograph's own pixels", "--detail model": "derender, `--detail model`",
+        "the same scene, model's colours": "model's rendering of the same scene",
+        "input": "unchanged photograph",
+        "input, brightness of the truth": "unchanged, brightness of the truth",
+        "input turned as a plane": "turned as a plane",
+        "another person's ratio": "ratio of another person's photographs",
+    }  # fmt: skip
+
+    def read(result: Any) -> Iterator[list[str]]:
+        yield ["PSNR, dB / SSIM", *angles.values()]
+        for name, scores in result[which].items():
+            shown = (scores.get(angle) for angle in angles)
+            cells = [
+                f"{psnr:.1f} / {ssim:.3f}" if psnr else "" for psnr, ssim in (s or (0, 0) for s in shown)
+            ]
+            yield [names.get(name, name), *cells]
+
+    return read
+
+
+def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[[Any], Iterator[list[str]]]:
+    """Rows of a protocol: for each head the score, what it is multiplied by, and its digits."""
+
+    def read(result: Any) -> Iterator[list[str]]:
+        for key in where:
+            result = result[key]
+        yield ["", *columns]
+        for name, row in result.items():
+            note = " (control)" if row["control"] else ""
+            yield [name + note, *(shown(row["scores"].get(key), by, n) for key, by, n in columns.values())]
+
+    def shown(score: Any, by: float, digits: int) -> str:
+        if score is None or score["value"] is None:
+            return ""
+        value, low, high = (None if score[k] is None else by * score[k] for k in ("value", "low", "high"))
+        text = f"{value:.{digits}f}"
+        return text if low is None else f"{text} ({low:.{digits}f}-{high:.{digits}f})"
+
+    return read
+
+
+def renderers(result: Any) -> Iterator[list[str]]:
+    """Reconstruction error of scenes optimised with each renderer, by effect, mean over seeds."""
+    cells = result["cells"]
+    names = list(dict.fromkeys(one["renderer"] for one in cells))
+    yield ["effect in the images; L1 with", *names]
+    for effect in dict.fromkeys(one["effect"] for one in cells):
+        means = []
+        for name in names:
+            errors = [one["l1"] for one in cells if (one["effect"], one["renderer"]) == (effect, name)]
+            means.append(f"{sum(errors) / len(errors):.4f}" if errors else "")
+        yield [effect, *means]
+
+
+def renderer_speed(result: Any) -> Iterator[list[str]]:
+    yield ["renderer", "forward, ms", "with gradients, ms", "with gradients / lambert"]
+    for one in result["cells"]:
+        cells = (("forward_ms", 1), ("forward_and_backward_ms", 1), ("forward_and_backward_over_lambert", 2))
+        yield [one["renderer"], *(f"{one[key]:.{digits}f}" for key, digits in cells)]
+
+
+def renderers_trained(result: Any, clear: bool = False) -> Iterator[list[str]]:
+    """Errors of models trained with each renderer, by effect or of ``clear`` images: mean, deviation."""
+    digits = {"normal_deg": 1, "albedo": 3, "albedo_chroma": 4, "l1": 4}
+    titles = ("normals, degrees", "albedo error", "chroma error", "L1", "albedo / lambert", "seeds")
+    yield ["effect in the images: renderer", *titles]
+    groups = _trained(result)
+    for effect, name in [pair for pair in groups if (pair[0] == "none") == clear]:
+        ones = groups[effect, name]
+        means = [_spread([one[key] for one in ones], n) for key, n in digits.items()]
+        plain = {one["seed"]: one["albedo"] for one in groups[effect, "lambert"]}
+        ratio = _spread([one["albedo"] / plain[one["seed"]] for one in ones], 2)
+        yield [f"{effect}: {name}", *means, ratio, ", ".join(str(one["seed"]) for one in ones)]
+
+
+def effect_numbers(result: Any) -> Iterator[list[str]]:
+    """Rank correlation and median errors of an effect's own numbers in trained models."""
+    yield ["number, renderer", "rank correlation", "median error", "after the best line", "of a constant"]
+    ends = ("spearman", "median_error", "median_error_of_line", "median_error_of_constant")
+    for (_, name), ones in _trained(result).items():
+        for number in [key.removesuffix("_spearman") for key in ones[0] if key.endswith("_spearman")]:
+            means = (_spread([one[f"{number}_{end}"] for one in ones], 2) for end in ends)
+            yield [f"{number.replace('_', ' ')}: {name}", *means]
+
+
+def _trained(result: Any) -> dict[tuple[str, str], list[Any]]:
+    """Cells of every seed by effect and renderer, in the order of a table."""
+    groups: dict[tuple[str, str], list[Any]] = {}
+    order = ["none", "shadows", "gloss", "lamps", "haze"]
+    for one in sorted(result["cells"], key=lambda one: (order.index(one["effect"]), one["seed"])):
+        groups.setdefault((one["effect"], one["renderer"]), []).append(one)
+    return groups
+
+
+def _spread(values: list[float], digits: int) -> str:
+    text = f"{fmean(values):.{digits}f}"
+    return text if len(values) < 2 else f"{text} ± {stdev(values):.{digits}f}"
+
+
+def renderers_yale(result: Any) -> Iterator[list[str]]:
+    """Residuals by the light's angle, and its azimuth and elevation, of scenes fitted to Extended Yale B."""
+    residuals = {"L1 to 25°": "0_25", "25° to 50°": "25_50", "50° to 77°": "50_78"}
+    yield ["renderer", *residuals, *(f"{what}: r, error" for what in ("azimuth", "elevation"))]
+    for one in result["cells"]:
+        shown = [f"{one[f'residual_{span}']:.4f}" for span in residuals.values()]
+        for what in ("azimuth", "elevation"):
+            shown.append(f"{one[f'{what}_correlation']:.3f}, {one[f'{what}_mean_error_deg']:.1f}°")
+        yield [one["renderer"], *shown]
+
+
+def million_rows(result: Any) -> Iterator[list[str]]:
+    yield ["1,000,000 rows of 128, one thread", "seconds"]
+    names = {
+        "faiss_build": f"FAISS, index of {result['lists']:,} cells",
+        "faiss_search": f"FAISS, {result['queries']} queries, recall {result['recall']}",
+        "exact_search": f"exact, {result['queries']} queries",
+        "duckdb_nearest_one": "DuckDB, one exact query",
+        "duckdb_count": "DuckDB, rows of each kind",
+    }
+    yield from ([name, f"{result['seconds'][key]:.2f}"] for key, name in names.items())
+
+
+def true_factors(result: Any) -> Iterator[list[str]]:
+    model, untrained = (result["rows"][name][0]["truth"] for name in ("model", "untrained encoder"))
+    yield ["true factor", *model["features"], "untrained, all"]
+    for place, name in enumerate(model["factors"]):
+        scores = (row[place] for row in (*model["score"], untrained["together"]))
+        yield [name, *(f"{round(score, 2) + 0:.2f}" for score in scores)]
+
+
+def disentangled(result: Any) -> Iterator[list[str]]:
+    """Similarity between factors and the swap test, of the model and each control."""
+    columns = ("Pearson per dimension", "CKA", "cross R2", "swap test, features", "swap test, decoded")
+    yield ["", *columns]
+    for name, (row, *_) in result["rows"].items():
+        alike, swap = row["similarity"] or {}, row["swap"] or {}
+        values = [
+            (row["pearson"]["mean_per_dimension"], 3), (alike.get("mean_cka_unbiased"), 3),
+            (alike.get("mean_cross_r2"), 3), (swap.get("ratio"), 2), (swap.get("ratio_parameters"), 2),
+        ]  # fmt: skip
+        label = name if name == "model" else f"{name} (control)"
+        yield [label, *("" if value is None else f"{value:.{digits}f}" for value, digits in values)]
+
+
+def swapped(result: Any) -> Iterator[list[str]]:
+    """How far each feature moves towards its donor's where one factor was exchanged."""
+    swap = result["rows"]["model"][0]["swap"]
+    yield ["", *swap["factors"]]
+    for name, row in zip(swap["factors"], swap["moved"], strict=True):
+        yield [f"{name} exchanged", *(f"{value:.2f}" for value in row)]
+    unexchanged = (f"{value:.2f}" for value in swap["unexchanged"])
+    yield ["nothing exchanged, rendered and encoded again", *unexchanged]
+
+
+def page_speed(result: Any) -> Iterator[list[str]]:
+    yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
+    for row in result["rows"]:
+        cells = (row[key] for key in ("pictures_per_cpu_second", "cpu_ms", "server_mb"))
+        yield [f"{row['size']} pixels, {row['clients']}", *(f"{cell:,.0f}" for cell in cells)]
+
+
+def aligned(result: Any) -> Iterator[list[str]]:
+    yield ["faces found", "recall", "precision", "eye error, mean", "90th percentile"]
+    for group in ("pasted", "lfw crops"):
+        for name, row in result[group].items():
+            keys = ("recall", "precision", "eye_error_mean", "eye_error_90th")
+            yield [f"{group}: {name}", *(f"{row[key]:.3f}" for key in keys)]
+
+
+def angles(result: Any) -> Iterator[list[str]]:
+    """Correlation, slope and error of each angle, beside the error of a constant answer."""
+    yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
+    for name in ("yaw", "pitch", "roll", "azimuth", "elevation"):
+        if name in result:
+            model = {key: score["value"] for key, score in result[name]["model"]["scores"].items()}
+            control = result[name]["constant answer"]["scores"]["error"]["value"]
+            cells = [f"{model[key]:.3f}" for key in ("r", "slope")] + [f"{model['error']:.1f}"]
+            yield [name, *cells, f"{control:.1f}"]
+
+
+BINS = {f"to {angle}°": (f"<= {angle}", 1, 3) for angle in (25, 50, 77)} | {"beyond": ("beyond", 1, 3)}
+PSNR = {f"to {angle}°": (f"<= {angle}", 1, 1) for angle in (12, 25, 50, 77)} | {"beyond": ("beyond", 1, 1)}
+PAIRS = {"accuracy": ("accuracy", 1, 3), "AUC": ("auc", 1, 3)}
+CLUSTERS = {"accuracy": ("accuracy", 1, 3), "NMI": ("nmi", 1, 3), "ARI": ("ari", 1, 3)}
+DEPTH = {"SIDE x 100": ("side", 100, 3), "MAD, degrees": ("mad_deg", 1, 1)}
+FACTORS = {
+    "albedo": ("albedo", 1, 3),
+    "lighting, degrees": ("light", 1, 1),
+    "viewpoint, degrees": ("camera", 1, 1),
+}
+BRIGHTNESS = {"correlation": ("r", 1, 3), "slope": ("slope", 1, 3), "error": ("error", 1, 4)}
+LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
+HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
+    "view 15": "view 15°",
+    "view 30": "view 30°",
+}
+FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
+    "edits-yale": ("photo_edits.json", edits("yale", LIGHTS)),
+    "edits-heads": ("photo_edits.json", edits("generated heads", HEADS)),
+    "training-step": ("training_step.json", speed.training_step),
+    "rasterize": ("rasterize.json", speed.rasterize),
+    "peers": ("rasterize_peers.json", speed.peers),
+    "reading": ("reading.json", speed.reading),
+    "memory": ("embedding_memory.json", speed.memory),
+    "step-memory": ("step_memory.json", speed.step_memory),
+    "million": ("clustering_million.json", speed.million),
+    "true-factors": ("true-factors.json", true_factors),
+    "disentanglement-generated": ("true-factors.json", disentangled),
+    "swap-matrix-generated": ("true-factors.json", swapped),
+    "bench": ("bench.json", speed.shares),
+    "compiled-step": ("compiled_step.json", speed.compiled),
+    "fitting": ("fitting.json", speed.fitting),
+    "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
+    "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
+    "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
+    "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
+    "verification": ("verification.json", scored(PAIRS, "rows")),
+    "pose": ("pose.json", angles),
+    "light": ("light.json", angles),
+    "light-optimised": ("light-optimised.json", angles),
+    "relighting": ("relighting.json", scored(PSNR, "psnr")),
+    "renderers": ("renderers_fit.json", renderers),
+    "renderers-speed": ("renderers_speed.json", renderer_speed),
+    "renderers-train": ("renderers_train.json", renderers_trained),
+    "renderers-clear": ("renderers_train.json", lambda result: renderers_trained(result, clear=True)),
+    "renderers-numbers": ("renderers_train.json", effect_numbers),
+    "renderers-yale": ("renderers_yaleb.json", renderers_yale),
+    "table-million": ("table_million.json", million_rows),
+    "view": ("view.json", page_speed),
+    "align": ("align.json", aligned),
+    "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
+    "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
+    "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
+    "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),
+    "cars-depth-generated": ("generated/cars-geometry.json", scored(DEPTH, "intervals", "geometry")),
+}

@@ -1,0 +1,94 @@
+"""Tables of measured speed and memory, each from the file of one benchmark: rows of cells, the head first."""
+
+from collections.abc import Iterator
+from typing import Any
+
+
+def training_step(result: Any) -> Iterator[list[str]]:
+    yield ["step of preset `paper`, batch 64", "images/s", "slowest to fastest", "ratio", "GFLOP an image"]
+    for row in result["rows"]:
+        low, high = row["spread"]
+        rate, ratio = f"{row['images_per_second']:.2f}", f"{row['ratio']:.2f}"
+        yield [row["name"], rate, f"{low:.2f} to {high:.2f}", ratio, f"{row['gflop_per_image']:.1f}"]
+
+
+def rasterize(result: Any) -> Iterator[list[str]]:
+    yield ["64 depth maps of 64 x 64, ms an image", "plain torch", "Numba", "ratio"]
+    for row in result["rows"]:
+        ms = row["ms_per_image"]
+        yield [row["part"], f"{ms['reference']:.3f}", f"{ms['numba']:.3f}", f"{row['ratio']:.1f}"]
+
+
+def peers(result: Any) -> Iterator[list[str]]:
+    yield [
+        "16 depth maps, forward and backward, ms",
+        *(f"{row['size']} x {row['size']}" for row in result["rows"]),
+    ]
+    for name in result["rows"][0]["milliseconds"]:
+        yield [name, *(f"{row['milliseconds'][name]['both ways']:,.1f}" for row in result["rows"])]
+
+
+def reading(result: Any) -> Iterator[list[str]]:
+    yield ["", "first start, CPU s", "later starts, CPU s", "highest memory, MB"]
+    for name, kind in result["starts"].items():
+        later = ", ".join(f"{one['cpu_s']:.2f}" for one in kind["later"])
+        first = kind["first"]
+        yield [
+            f"{name}, {kind['files']:,} images",
+            f"{first['cpu_s']:.1f}",
+            later,
+            f"{first['memory_mb']:.0f}",
+        ]
+
+
+def memory(result: Any) -> Iterator[list[str]]:
+    yield ["images embedded", "highest memory, MB", "before the first image, MB", "CPU s"]
+    for row in result["rows"]:
+        yield [
+            f"{row['pictures']:,}",
+            *(f"{row[key]:,.0f}" for key in ("peak_mb", "before_mb", "cpu_seconds")),
+        ]
+
+
+def step_memory(result: Any) -> Iterator[list[str]]:
+    yield ["image size", "whole batch, MB", "four chunks, MB", "whole, CPU s", "four chunks, CPU s"]
+    by_size: dict[int, dict[int, Any]] = {}
+    for row in result["rows"]:
+        by_size.setdefault(row["size"], {})[row["chunks"]] = row
+    for size, rows in by_size.items():
+        mb = [f"{rows[chunks]['step_mb']:,.0f}" for chunks in (1, 4)]
+        yield [f"{size} pixels", *mb, *(f"{rows[chunks]['cpu_seconds']:.0f}" for chunks in (1, 4))]
+
+
+def million(result: Any) -> Iterator[list[str]]:
+    yield ["1,000,000 rows of 512", "seconds", "accuracy", "ARI with the drawn groups"]
+    for run in result["runs"]:
+        scores = run["scores"]["scores"]
+        cells = (f"{scores[key]['value']:.3f}" for key in ("accuracy", "ari"))
+        yield [run["method"], f"{run['seconds']:.0f}", *cells]
+
+
+def shares(result: Any) -> Iterator[list[str]]:
+    yield ["median of five rounds", "ratio", "least to most", "images or rows a second"]
+    for row in result["rows"]:
+        speeds = f"{row['ours_per_second']:,.0f} / {row['theirs_per_second']:,.0f}"
+        yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}", speeds]
+
+
+def compiled(result: Any) -> Iterator[list[str]]:
+    yield ["step, batch 16", "CPU ms", "compiled, CPU ms", "ratio", "least to most", "compiling, CPU s"]
+    for row in result["rows"]:
+        extras = ", bfloat16" if row["precision"] == "bf16-mixed" else ""
+        spread = f"{row['least']:.2f} to {row['most']:.2f}"
+        times = f"{row['eager_ms']:,.0f}", f"{row['compiled_ms']:,.0f}"
+        what = f"`{row['preset']}`, {row['size']} px{extras}"
+        yield [what, *times, f"{row['ratio']:.2f}", spread, f"{row['compiling_cpu_s']:.0f}"]
+
+
+def fitting(result: Any) -> Iterator[list[str]]:
+    yield [f"{result['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
+    before = 1000 * result["fit"]["portions_of_4_s"] / result["images"]
+    if "feed_forward_ms_per_image" in result["fit"]:
+        yield ["feed-forward", f"{result['fit']['feed_forward_ms_per_image']:.1f}"]
+    yield [f"optimised for {result['steps']} steps, portions of 64", f"{result['fit']['ms_per_image']:.1f}"]
+    yield [f"optimised for {result['steps']} steps, portions of four", f"{before:.1f}"]
