@@ -299,6 +299,8 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "swap-matrix-generated": ("true-factors.json", swapped),
     "bench": ("bench.json", speed.shares),
     "compiled-step": ("compiled_step.json", speed.compiled),
+    "gpu-steps": ("gpu.json", speed.gpu_steps),
+    "gpu-agreement": ("gpu.json", speed.gpu_agreement),
     "fitting": ("fitting.json", speed.fitting),
     "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
     "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),

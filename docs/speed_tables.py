@@ -92,3 +92,27 @@ def fitting(result: Any) -> Iterator[list[str]]:
         yield ["feed-forward", f"{result['fit']['feed_forward_ms_per_image']:.1f}"]
     yield [f"optimised for {result['steps']} steps, portions of 64", f"{result['fit']['ms_per_image']:.1f}"]
     yield [f"optimised for {result['steps']} steps, portions of four", f"{before:.1f}"]
+
+
+def gpu_steps(result: Any) -> Iterator[list[str]]:
+    yield ["one GPU", "launched one by one, images/s", "CUDA graph, images/s", "ratio", "memory, GB"]
+    for batch, rate in result["literal"].items():
+        yield [f"literal `paper`, 64 px, batch {batch}, float32", f"{float(rate):,.0f}", "", "", ""]
+    ways: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for row in result["rows"]:
+        key = row["preset"], row["size"], row["batch"], row["precision"]
+        ways.setdefault(key, {})[row["cuda_graph"]] = row
+    for (preset, size, batch, precision), rows in ways.items():
+        extras = "bfloat16" if precision == "bf16-mixed" else "float32"
+        fast, plain = rows["auto"]["images_per_second"], rows.get("off", {}).get("images_per_second")
+        one, ratio = ("", "") if plain is None else (f"{plain:,.0f}", f"{fast / plain:.1f}")
+        what = f"`{preset}`, {size} px, batch {batch}, {extras}"
+        yield [what, one, f"{fast:,.0f}", ratio, f"{rows['auto']['memory_gb']:.1f}"]
+
+
+def gpu_agreement(result: Any) -> Iterator[list[str]]:
+    gradients = [key for key in result["agreement"][0] if key.startswith("gradient")]
+    yield ["Triton beside plain torch", "image", "depth", "mask", "largest of four gradients"]
+    for row in result["agreement"]:
+        errors = row["image"], row["depth"], row["mask"], max(row[key] for key in gradients)
+        yield [f"{row['size']} px, {row['dtype']}", *(f"{error:.0e}" if error else "0" for error in errors)]

@@ -20,9 +20,9 @@ BUDGET = {  # lines, files
     "evaluation": (7_820, 38),  # public functions name their errors
     "report": (4_350, 25),
     "cli": (2_320, 32),
-    "training": (3_420, 16),
+    "training": (3_560, 17),  # CUDA graphs
     "baselines": (2_470, 11),
-    "render": (1_680, 15),
+    "render": (1_690, 15),
     "features": (1_380, 8),
     "interpretation": (1_080, 5),
     "photo": (1_500, 7),  # new light falls on the object alone
@@ -30,13 +30,13 @@ BUDGET = {  # lines, files
     "storage": (940, 8),
     "objectives": (640, 5),
     "postprocess": (740, 6),
-    "scene": (860, 11),
+    "scene": (865, 11),
     "demo": (520, 3),
     "renderers": (660, 8),
     "learn": (1_210, 6),
 }
-TOTAL = (40_280, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_840
+TOTAL = (40_450, 249)  # on the way to (37_000, 270)
+TEST_LINES = 25_890
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -13,7 +13,7 @@ from tests.render.scenes import FOV_DEG, scene
 from tests.tolerances import assert_agrees
 from torch import Tensor
 
-from derender.render import available_backends, chosen_backend
+from derender.render import available_backends, backends, chosen_backend
 from derender.render.backends import INSTALLED
 from derender.render.rasterize import CHOOSE, reference
 from derender.render.warping import FORWARD, sample
@@ -225,7 +225,10 @@ def test_importing_the_renderer_does_not_import_its_compilers():
 
 
 def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
-    for installed, on_cpu, on_cuda in ((True, "numba", "triton"), (False, "reference", "reference")):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    cases = ((True, True, "numba", "triton"), (True, False, "numba", "reference"))
+    for installed, compiler, on_cpu, on_cuda in (*cases, (False, True, "reference", "reference")):
+        monkeypatch.setattr(backends, "_launches", lambda found=compiler: found)
         for name in INSTALLED:
             monkeypatch.setitem(INSTALLED, name, installed)
         assert chosen_backend("cpu") == chosen_backend(torch.device("cpu"), "auto") == on_cpu

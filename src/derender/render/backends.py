@@ -8,8 +8,12 @@ Triton also runs on the CPU in its interpreter, slowly, for tests.
 
 import importlib
 import importlib.util
+import os
+import shutil
+import sysconfig
 from collections.abc import Callable, Sequence
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -43,9 +47,8 @@ def chosen_backend(device: torch.device | str, backend: str = "auto", pixels: fl
     if backend == "auto":
         if kind == "cpu" and pixels <= FEW_PIXELS and not torch.is_grad_enabled():
             return "reference"
-        return next(
-            (name for name, works in WORKS_ON.items() if works == kind and INSTALLED[name]), "reference"
-        )
+        usable = {**INSTALLED, "triton": INSTALLED["triton"] and (interpreted() or _launches())}
+        return next((name for name, works in WORKS_ON.items() if works == kind and usable[name]), "reference")
     if backend == "reference":
         return backend
     if not INSTALLED[backend]:
@@ -60,6 +63,12 @@ def chosen_backend(device: torch.device | str, backend: str = "auto", pixels: fl
             + slowly * (backend == "triton")
         )
     return backend
+
+
+def _launches() -> bool:
+    """Whether Triton finds what it builds its launcher with: a C compiler and Python's header."""
+    compiler = "CC" in os.environ or any(shutil.which(name) for name in ("gcc", "clang"))
+    return compiler and Path(sysconfig.get_paths()["include"], "Python.h").is_file()
 
 
 def operators(

@@ -76,7 +76,7 @@ def save_checkpoint(
                     "is kept"
                 )
         described = {"format": FORMAT, "state": asdict(state), "groups": kept["param_groups"]}
-        (temporary / STATE_FILE).write_text(json.dumps(described))
+        (temporary / STATE_FILE).write_text(json.dumps(described, default=float))  # a rate on the device
         seal(temporary)
 
 

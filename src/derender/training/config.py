@@ -129,9 +129,15 @@ class LoopSettings(Settings):
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
     channels_last: bool = True
+    cuda_graph: Literal["auto", "off"] = "auto"  # on a GPU: replay recorded steps where that is faster
     deterministic: bool = False
     watch: bool = True  # look for collapse and return to the last good checkpoint
     seed: int = 0
+
+    @field_validator("cuda_graph", mode="before")
+    @classmethod
+    def _off(cls, value: Any) -> Any:
+        return "off" if value is False else value  # as YAML reads the word
 
 
 class TrainConfig(LoopSettings):

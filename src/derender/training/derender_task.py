@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -81,10 +81,15 @@ class DerenderTask(TrainingTask):
     ranks: Ranks = ALONE
     whitening: Whitening | None = None
     outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION
+    replayable: ClassVar[bool] = True
 
     def shared(self, ranks: Ranks) -> "DerenderTask":
         ranks.check(self.config.batch_size)
         return replace(self, ranks=ranks)
+
+    def phase(self, done: float) -> float | None:
+        own = own_share(self.config.objective, done)
+        return own if own in (0.0, 1.0) else None
 
     def check(self) -> None:
         """Missing perceptual weights are an error before a folder is made."""

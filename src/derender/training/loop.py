@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
+from torch import Generator, Tensor
 
 from derender.data import ImageSet, split_indices
 from derender.storage.atomic import DamageNoticed, atomic_file
@@ -30,6 +30,7 @@ from derender.training.checkpoint import (
     resume_from,
     save_checkpoint,
 )
+from derender.training.cuda_graph import Replayed
 from derender.training.distributed import open_fabric, ranks_of
 from derender.training.process import (
     TrainingInterrupted,
@@ -105,7 +106,8 @@ class _Run:
             step = task.step_module(self.model, self.folder, batches.sample(), phase)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
-        self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True)
+        on_gpu = fabric.device.type == "cuda"
+        self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True, capturable=on_gpu)
         self.module = fabric.setup_module(step)
         self.precision = network_precision(config.precision, fabric.device)
         held_out = split.validation[:MAX_VALIDATION_IMAGES]
@@ -121,6 +123,12 @@ class _Run:
         self.notes: list[tuple[int, list[str], list[str], Tensor]] = []
         self.broken = torch.zeros((), device=fabric.device)
         """1 as soon as a gradient is not finite: from there on no step changes the weights."""
+        for group in self.optimiser.param_groups if on_gpu else ():
+            group["lr"] = torch.zeros((), device=fabric.device)  # which a recorded step reads
+        self.noise = Generator(fabric.device) if on_gpu and task.replayable else None
+        self.replayed = None
+        if self.noise is not None and ranks.count == 1 and config.cuda_graph == "auto":
+            self.replayed = Replayed(self.update, self.noise, self.note)
         self.model_images: int | None = None
         self.writer: "SummaryWriter | None" = None
         if ranks.first:
@@ -129,7 +137,7 @@ class _Run:
 
             self.writer = SummaryWriter(str(out / "tensorboard"), purge_step=self.state.images)
             if note is not None:
-                self.log("note", {"text": note})
+                self.note(note)
 
     def go_on(self) -> TrainResult:
         """Train from where the run stands until something ends it."""
@@ -189,23 +197,42 @@ class _Run:
     def step(self) -> StepLosses:
         """One batch: losses, gradients, update, watcher."""
         config, state = self.config, self.state
-        position = state.images // config.batch_size
+        position, done = state.images // config.batch_size, state.images / config.images
         for group in self.optimiser.param_groups:
-            group["lr"] = group.get("share", 1.0) * config.optimiser.rate(state.images, config.images)
-        noise = random_stream(config.seed, "perturb", position)
-        rows = self.train_rows[self.reader.batches.order(position, self.ranks)]
-        done = state.images / config.images
-        result = compute_step(self.module, self.reader.at(position), noise, self.precision, done, rows)
+            rate = group.get("share", 1.0) * config.optimiser.rate(state.images, config.images)
+            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        drawn = random_stream(config.seed, "perturb", position)
+        if self.noise is not None:
+            self.noise.manual_seed(drawn.initial_seed())
+        images = self.reader.at(position)
+        if self.replayed is not None:
+            (result, gradients, stages), note = self.replayed(images, done, self.task.phase(done))
+        else:
+            rows = self.train_rows[self.reader.batches.order(position, self.ranks)]
+            (result, gradients, stages), note = self.update(images, done, self.noise or drawn, rows)
+        state.images += config.batch_size
+        self.notes.append((state.images, gradients, stages, note))
+        return result
+
+    def update(
+        self, images: Tensor, done: float, noise: Generator | None = None, rows: Tensor | None = None
+    ) -> tuple[tuple[StepLosses, list[str], list[str]], Tensor]:
+        """Change the weights by a batch: its losses, names of gradients and stages, and notes of both.
+
+        Nothing here waits for the device.
+        """
+        noise = self.noise if noise is None else noise
+        assert noise is not None
+        self.optimiser.zero_grad(set_to_none=True)
+        result = compute_step(self.module, images, noise, self.precision, done, rows)
         self.fabric.backward(result.total)
         gradients, largest = largest_gradients(self.model)
-        self.broken = torch.maximum(self.broken, 1 - largest.isfinite().all().float())
+        self.broken.copy_(torch.maximum(self.broken, 1 - largest.isfinite().all().float()))
         self.optimiser.found_inf = self.broken  # pyright: ignore[reportAttributeAccessIssue]
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
-        state.images += config.batch_size
         stages, note = ([], largest[:0]) if self.watcher is None else self.watcher.note(result)
-        self.notes.append((state.images, gradients, stages, torch.cat([largest, note])))
-        return result
+        return (result, gradients, stages), torch.cat([largest, note])
 
     def due(self, before: int, now: int, *, stop: bool) -> bool:
         """Whether something is to be done that needs the notes of the steps so far; all ranks agree."""
@@ -326,6 +353,10 @@ class _Run:
         for name, value in values.items():
             if isinstance(value, float):
                 self.writer.add_scalar(f"{kind}/{name}", value, images)
+
+    def note(self, text: str) -> None:
+        """Log a sentence."""
+        self.log("note", {"text": text})
 
     def close(self) -> None:
         """Finish all writing."""

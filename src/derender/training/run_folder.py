@@ -32,7 +32,7 @@ FORMAT = 1
 
 _MAY_CHANGE_ON_RESUME = (
     *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch", "keep"),
-    "accumulate",
+    *("accumulate", "cuda_graph"),
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
 _BEGUN = (LOCK_FILE, "environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int64, UInt8
@@ -49,10 +49,16 @@ class TrainingTask(ABC):
 
     config: Any
     outside_loss: Any = ()
+    replayable: ClassVar[bool] = False
+    """Whether a step draws on the device of its generator and reads nothing back: then it can be recorded."""
 
     def shared(self, ranks: Ranks) -> "TrainingTask":
         """The same task as one of several ranks; a ValueError where it needs its batch whole."""
         raise ValueError("this is trained on one device: start it without torchrun")
+
+    def phase(self, done: float) -> Any:
+        """What steps depend on besides tensors at this share of the run; None: on what always changes."""
+        return 1.0
 
     @abstractmethod
     def check(self) -> None:

@@ -1,0 +1,97 @@
+"""A training step recorded once as a CUDA graph and replayed: the host launches it whole, not by kernels.
+
+The kernels of a step take microseconds each, so that it waits for the host most of the time. Both ways run
+the same kernels and give the same bits: a run may change between them, and resumes exactly.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+WARMING = 16
+"""Ordinary steps before the clock runs; kernels are compiled in them."""
+TIMED = 16
+"""Steps of either way that are timed."""
+
+
+class Replayed:
+    """A training step that is replayed from some call on, if that is faster.
+
+    Args:
+        update: the step: images (N, 3, H, W) of a batch and the share of the run that is done, to its result
+            and a tensor of notes. It never waits for the device, and draws from ``noise`` alone.
+        noise: a generator on the device, seeded anew before each call.
+        report: is given a sentence once both ways were timed.
+    """
+
+    def __init__(
+        self, update: Callable[[Tensor, float], tuple[Any, Tensor]], noise: Generator,
+        report: Callable[[str], None],
+    ):  # fmt: skip
+        self.update, self.noise, self.report = update, noise, report
+        self._wanted = True
+        self._stream = torch.cuda.Stream(noise.device)
+        self._graph: Any = None
+        self._kept: Any = None
+        self._phase: Any = None
+        self._calls, self._seconds = 0, [0.0, 0.0]
+
+    def __call__(self, images: Tensor, done: float, phase: Any) -> tuple[Any, Tensor]:
+        """Result and notes of a step; a graph is recorded for each ``phase``, none for None.
+
+        The next replay overwrites the result, not the notes.
+        """
+        usual = torch.cuda.current_stream(images.device)
+        self._stream.wait_stream(usual)
+        with torch.cuda.stream(self._stream):
+            if phase is None or not self._wanted:
+                result = self.update(images, done)
+            else:
+                result = self._either(images, done, phase)
+        usual.wait_stream(self._stream)
+        return result
+
+    def _either(self, images: Tensor, done: float, phase: Any) -> tuple[Any, Tensor]:
+        """The step in one way, timed where the choice is still open."""
+        self._calls += 1
+        way, timed = divmod(self._calls - WARMING - 1, TIMED)
+        if way > 0 and phase != self._phase:
+            self._record(images, done, phase)
+        step = self.update if self._graph is None else self._replay
+        if way not in (0, 1):
+            return step(images, done)
+        torch.cuda.synchronize()
+        began = time.perf_counter()
+        result = step(images, done)
+        torch.cuda.synchronize()
+        self._seconds[way] += time.perf_counter() - began
+        if (way, timed) == (1, TIMED - 1) and self._graph is not None:
+            faster = self._seconds[0] / self._seconds[1]
+            if faster < 1:
+                self._leave(f"is slower ({faster:.2f} times the speed)")
+            else:
+                self.report(f"steps are replayed as a CUDA graph, {faster:.1f} times as fast")
+        return result
+
+    def _record(self, images: Tensor, done: float, phase: Any) -> None:
+        """Record the step without running it."""
+        self._graph, self._phase, self._images = torch.cuda.CUDAGraph(), phase, images.clone()
+        self._graph.register_generator_state(self.noise)
+        try:
+            with torch.cuda.graph(self._graph, stream=self._stream):
+                self._kept = self.update(self._images, done)
+        except RuntimeError as error:  # no memory for it, or a kernel that cannot be recorded
+            self._leave(f"could not be recorded ({str(error).splitlines()[0]})")
+
+    def _replay(self, images: Tensor, done: float) -> tuple[Any, Tensor]:
+        self._images.copy_(images)
+        self._graph.replay()
+        result, notes = self._kept
+        return result, notes.clone()
+
+    def _leave(self, why: str) -> None:
+        self._graph, self._kept, self._wanted = None, None, False
+        self.report(f"steps are launched one by one: a CUDA graph {why}")
