@@ -329,11 +329,10 @@ def test_samples_that_are_pipes_devices_or_giants_do_not_hold_up_a_report(run):
     assert text.count("data:image/jpeg") == 1
 
 
-@pytest.mark.parametrize("packing", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_members_that_unpack_to_much_are_judged_by_their_header(tmp_path, packing):
+def test_members_that_unpack_to_much_are_judged_by_their_header(tmp_path):
     """And those whose header stands at the end one at a time; each would take 66 MB."""
     zeros, whole = bytes(66 << 20), encoded(smooth(1))
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", packing) as archive:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("good.png", whole)
         for number in range(3):
             archive.writestr(f"zeros {number}.png", zeros)
@@ -346,21 +345,19 @@ def test_members_that_unpack_to_much_are_judged_by_their_header(tmp_path, packin
         tracemalloc.stop()
     assert images.files == ("good.png",)
     reasons = {row.file: row.reason for row in images.skipped}
-    deflated = packing == zipfile.ZIP_DEFLATED
-    due = "66 MiB of 48 x 40 pixels" if deflated else "unpacks to 66 MiB, more than 64 MiB"
-    assert len(reasons) == 4 and reasons["long.png"] == due
+    assert len(reasons) == 4 and reasons["long.png"] == "66 MiB of 48 x 40 pixels"
 
 
 @pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_members_that_unpack_to_more_than_they_say_are_unpacked_in_steps(tmp_path, packing):
+def test_members_in_whose_packing_few_bytes_are_gigabytes_are_not_unpacked(tmp_path, packing):
     with zipfile.ZipFile(tmp_path / "a.zip", "w", packing) as archive:
-        archive.writestr("good.png", encoded(smooth(1)))
+        archive.writestr("good.png", encoded(smooth(1)), zipfile.ZIP_DEFLATED)
         archive.writestr("liar.png", bytes(160 << 20) + encoded(smooth(1)))
         archive.infolist()[1].file_size = 100_000
     tracemalloc.start()
     try:
         images = read_images(tmp_path / "a.zip", 16)
-        assert tracemalloc.get_traced_memory()[1] < 130 << 20
+        assert tracemalloc.get_traced_memory()[1] < 20 << 20
     finally:
         tracemalloc.stop()
     assert images.files == ("good.png",) and len(images.skipped) == 1

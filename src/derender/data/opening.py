@@ -5,14 +5,13 @@ sets of Hugging Face's library) are read from front to back. They take ``?column
 ``revision``) before ``::PART``; others take ``?half=test`` or ``?half=development``. A path that exists is
 always a path.
 
-Members of a zip with absolute names or ``..`` in them and encrypted ones are passed over and listed. Refused
-are another size or CRC-32 than in the directory, and a size beyond ``FILE_LIMIT_BYTES``. So is a member that
-reaches into the next: members within each other let small archives unpack to endless ones.
+Members of a zip with absolute names or ``..`` in them, encrypted ones and those packed by bzip2 or LZMA are
+passed over and listed. Refused are another size or CRC-32 than in the directory, and a size beyond
+``FILE_LIMIT_BYTES``. So is a member that reaches into the next: members within each other let small archives
+unpack to endless ones.
 """
 
-import bz2
 import hashlib
-import lzma
 import os
 import re
 import struct
@@ -47,19 +46,23 @@ from derender.data.stream import Sample, Stream
 from derender.storage.places import SUFFIXES, nearest_sibling, require_known
 
 _HEADER_BYTES = 30
-_ENCRYPTED, _STEP = 1, 4096
+_ENCRYPTED = 1
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
 _UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
 
 # What unpacking raises on damaged members (found by feeding it such).
 _UNPACKING_ERRORS = (
     *(OSError, ValueError, LookupError, EOFError, RuntimeError, MemoryError, OverflowError),
-    *(struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile),
+    *(struct.error, zlib.error, zipfile.BadZipFile),
 )
 
 
 class ZipSource(Source):
-    """The members of a zip that are neither hidden, unsafe nor encrypted; of two with one name the later."""
+    """The members of a zip that are neither hidden, unsafe, encrypted nor packed in a way of their own.
+
+    Of two with one name the later.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -79,6 +82,8 @@ class ZipSource(Source):
                 faults.add((file, "unsafe name in the zip (absolute or with ..)"))
             elif member.flag_bits & _ENCRYPTED:
                 faults.add((file, "encrypted in the zip"))
+            elif member.compress_type not in _PACKINGS:
+                faults.add((file, "packed by bzip2, LZMA or the like: pack the zip by deflate, as usual"))
             else:
                 self._members[file] = member
         self.files = tuple(sorted(self._members))
@@ -88,45 +93,24 @@ class ZipSource(Source):
 
     def read(self, file: str) -> bytes:
         member = self._members[file]
-        size, as_asked = member.file_size, member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-        large = size > LARGE_BYTES and is_image(file)
-        most = LARGE_BYTES if large and not as_asked else FILE_LIMIT_BYTES
-        if size > most:
-            raise ValueError(f"unpacks to {size >> 20:,} MiB, more than {most >> 20:,} MiB")
+        size = member.file_size
+        if size > FILE_LIMIT_BYTES:
+            raise ValueError(f"unpacks to {size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB")
         end = member.header_offset + _HEADER_BYTES + len(member.orig_filename) + member.compress_size
         try:
             if end > self._following[member.header_offset]:
                 raise ValueError("it reaches into what comes after it")
-            if member.compress_type == zipfile.ZIP_BZIP2:
-                content = self._from_bzip2(member)
-            else:
-                with self._archive.open(member) as stream:
-                    content = stream.read(min(size, HEAD_BYTES if as_asked else _STEP))
-                    if large:
-                        refuse_by_header(content, size)
-                    if as_asked:
-                        content += stream.read(size - len(content))  # without a number it would never end
-                    else:  # the fewer packed bytes zipfile reads, the less it unpacks at once
-                        content += b"".join(stream.read(_STEP) for _ in range(0, size - len(content), _STEP))
+            with self._archive.open(member) as stream:
+                content = stream.read(min(size, HEAD_BYTES))
+                if size > LARGE_BYTES and is_image(file):
+                    refuse_by_header(content, size)
+                content += stream.read(size - len(content))  # without a number it would never end
             if len(content) != size:
                 raise ValueError("it is shorter than the directory says")
         except Unreadable:
             raise
         except _UNPACKING_ERRORS as problem:
             raise ValueError(f"cannot be unpacked: {problem}") from problem
-        return content
-
-    def _from_bzip2(self, member: zipfile.ZipInfo) -> bytes:
-        """The content, no more of it than the directory says: zipfile would unpack 4 KB to gigabytes."""
-        packed = zipfile.ZipInfo(member.orig_filename)
-        packed.header_offset, packed.flag_bits = member.header_offset, member.flag_bits
-        packed.compress_size = packed.file_size = member.compress_size
-        with self._archive.open(packed) as stream:
-            content = bz2.BZ2Decompressor().decompress(
-                stream.read(member.compress_size), member.file_size + 1
-            )
-        if zlib.crc32(content) != member.CRC:
-            raise ValueError("its CRC-32 is not that of the directory")
         return content
 
     def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
