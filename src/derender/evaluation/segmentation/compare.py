@@ -218,11 +218,9 @@ def segment(
         rows.append(row(variant.title, not variant.pretrained, runs, trainable))
     apart = Memory(memory.folder)  # controls are cached as well, but are no runs
     for title, control in CONTROLS.items():
-        runs = []
-        for seed in seeds if title == "pixel colour" else seeds[:1]:
-            made = partial(lambda control, seed: counted(control(data, seed)), control, seed)
-            runs.append(apart.recall("segment-control", {**same, "seed": seed, "control": title}, made))
-        rows.append(row(title, True, runs, 0))
+        made = partial(lambda control: counted(control(data)), control)
+        run = apart.recall("segment-control", {**same, "control": title}, made)
+        rows.append(row(title, True, [run], 0))
     judged = zip(rows, with_verdicts([row.scored for row in rows]), strict=True)
     compared = tuple(replace(row, scored=scored) for row, scored in judged)
     result = SegmentationComparison(compared, data, tuple(seeds), settings, shown)

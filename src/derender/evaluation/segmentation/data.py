@@ -1,7 +1,7 @@
 """Images with masks, divided into training and test images, and controls without a trained network.
 
 Controls learn from the training images only. Faces are aligned, so the most frequent class at a place already
-draws a face. Skin, hair and background differ in colour; principal components hold the pose of the face.
+draws a face; principal components also hold its pose.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,6 @@ from derender.data import ImageSet, split_indices
 from derender.evaluation.pixels import component_count
 
 TEST_FRACTION = 0.2
-COLOUR_PIXELS = 20_000
 COMPONENT_IMAGES = 2_000
 _CHUNK = 512
 
@@ -90,39 +89,14 @@ def divide(
     )
 
 
-def most_frequent(data: SegmentationData, seed: int = 0) -> np.ndarray:
-    """(T, S, S): always the class with the most training pixels."""
-    return np.full(data.masks[data.test].shape, data.shares(data.train).argmax(), np.uint8)
-
-
-def most_frequent_at_place(data: SegmentationData, seed: int = 0) -> np.ndarray:
+def most_frequent_at_place(data: SegmentationData) -> np.ndarray:
     """(T, S, S): the class that most training masks have at this place; of two even ones the lower."""
     learned = data.masks[data.train]
     counts = np.stack([(learned == number).sum(axis=0) for number in range(len(data.classes))])
     return np.tile(counts.argmax(axis=0).astype(np.uint8), (len(data.test), 1, 1))
 
 
-def by_colour(data: SegmentationData, seed: int = 0) -> np.ndarray:
-    """(T, S, S): logistic regression from a pixel's red, green and blue alone, on 20,000 training pixels."""
-    from sklearn.linear_model import LogisticRegression
-
-    def colours(pixels: np.ndarray) -> np.ndarray:
-        """In -2..2, where the regression's penalty is mild."""
-        return pixels.astype(np.float64) / 63.75 - 2
-
-    masks = data.masks.reshape(len(data.masks), -1)
-    pool = masks[data.train].size
-    drawn = np.random.default_rng(seed).choice(pool, min(COLOUR_PIXELS, pool), replace=False)
-    rows, places = data.train[drawn // masks.shape[1]], drawn % masks.shape[1]
-    flat, classes = data.images.reshape(len(masks), 3, -1), masks[rows, places]
-    if len(np.unique(classes)) == 1:
-        return np.full(data.masks[data.test].shape, classes[0], np.uint8)
-    regression = LogisticRegression(max_iter=1_000).fit(colours(flat[rows, :, places]), classes)
-    answers = [regression.predict(colours(flat[row].T)) for row in data.test]
-    return np.stack(answers).reshape(data.masks[data.test].shape).astype(np.uint8)
-
-
-def by_components(data: SegmentationData, seed: int = 0) -> np.ndarray:
+def by_components(data: SegmentationData) -> np.ndarray:
     """(T, S, S): the best class of a linear regression from the image's principal components at each place.
 
     64 components (a quarter of the training images, where that is fewer) of at most 2,000 training images.
@@ -140,7 +114,7 @@ def by_components(data: SegmentationData, seed: int = 0) -> np.ndarray:
         )
 
     places = np.linspace(0, len(data.train) - 1, min(len(data.train), COMPONENT_IMAGES)).astype(int)
-    pca = PCA(component_count(len(data.train)), random_state=seed).fit(flat(data.train[places]))
+    pca = PCA(component_count(len(data.train)), random_state=0).fit(flat(data.train[places]))
     learned = data.masks[data.train].reshape(len(data.train), -1)
     solver, tested = np.linalg.pinv(described(data.train)), described(data.test)
     best = np.zeros((len(data.test), learned.shape[1]), np.uint8)
@@ -153,10 +127,8 @@ def by_components(data: SegmentationData, seed: int = 0) -> np.ndarray:
     return best.reshape(len(best), *data.masks.shape[1:])
 
 
-CONTROLS: Mapping[str, Callable[[SegmentationData, int], np.ndarray]] = {
+CONTROLS: Mapping[str, Callable[[SegmentationData], np.ndarray]] = {
     "each place's class": most_frequent_at_place,
-    "pixel colour": by_colour,
     "PCA": by_components,
-    "most frequent class": most_frequent,
 }
 """By row name."""

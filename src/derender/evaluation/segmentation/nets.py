@@ -2,10 +2,9 @@
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs.
 Neither the loss nor the batch size is stated: cross-entropy, and 64, or fewer of few images. To the paper's
-control, one encoder from fresh weights, this table adds two fresh encoders, trained and frozen. A pre-trained
-encoder keeps its BatchNorm statistics while its weights learn; a fresh one that is frozen gets those of the
-training images. One network begins with the decoder that was distilled beside the encoders. Leaves out
-augmentation, class weights and early stopping.
+control, one encoder from fresh weights, this table adds two fresh encoders. A pre-trained encoder keeps its
+BatchNorm statistics while its weights learn. One network begins with the decoder that was distilled beside
+the encoders. Leaves out augmentation, class weights and early stopping.
 """
 
 import copy
@@ -20,9 +19,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
-from torch.optim.swa_utils import update_bn
 
-from derender.data import as_float
 from derender.evaluation.segmentation.data import SegmentationData
 from derender.features import map_batches, named
 from derender.features.extract import as_batch
@@ -31,7 +28,6 @@ from derender.settings import Settings
 from derender.training.process import freed_memory_kept
 
 LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
-STATISTICS_IMAGES = 512
 
 LEVELS_KEPT = 2
 """Levels, finest first, whose BatchNorm keeps its statistics in encoders and a decoder trained together."""
@@ -60,7 +56,6 @@ VARIANTS: Mapping[str, Variant] = {
     "joint-frozen": Variant("joint encoders, frozen", _BOTH, True, True),
     "random": Variant("random start", _ONE, False, False),
     "joint-random": Variant("random start, joint", _BOTH, False, False),
-    "joint-random-frozen": Variant("random, joint, frozen", _BOTH, False, True),
 }
 """By name on the command line."""
 
@@ -169,13 +164,7 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
         torch.manual_seed(decoder_seed)
         how = {"frozen": variant.frozen, "kept_statistics": variant.pretrained}
         decoder = model.unet_decoder if variant.decoder else None
-        net = SegmentationNet(encoders, len(data.classes), decoder=decoder, **how).to(model.device)
-    if variant.frozen and not variant.pretrained:
-        rows = data.train[:STATISTICS_IMAGES]
-        parts = np.array_split(rows, max(1, len(rows) // LARGEST_BATCH))
-        for encoder in encoders:
-            update_bn((as_float(data.images[part]) for part in parts), encoder, model.device)
-    return net
+        return SegmentationNet(encoders, len(data.classes), decoder=decoder, **how).to(model.device)
 
 
 def train_segmenter(
