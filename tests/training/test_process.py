@@ -1,5 +1,6 @@
 """The process of a run: one at a time writes it; torch's switch goes back; freed memory is reused."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -85,42 +86,32 @@ def other(tmp_path):
     process.stdout.close()
 
 
-def test_a_second_process_is_told_who_writes_and_a_killed_one_is_taken_over(other, tmp_path):
+def test_a_second_process_is_refused_and_a_killed_one_is_taken_over(other, tmp_path):
     run = tmp_path / "run"
-    with pytest.raises(ValueError, match=f"run is being written by process {other.pid} on .*: wait for it"):
+    with pytest.raises(ValueError, match="run is being written by another process: wait for it"):
         locked(run).__enter__()
     other.send_signal(signal.SIGKILL)
     other.wait()
-    assert (run / LOCK_FILE).exists()
-    with locked(run):
-        assert f'"pid":{os.getpid()}' in (run / LOCK_FILE).read_text()
-    assert not list(run.iterdir())
+    (run / "config.yaml").touch()
+    with locked(run), locked(run):
+        assert (run / LOCK_FILE).exists()
+    assert (run / "config.yaml").exists()
 
 
-def test_a_lock_of_another_host_is_named_and_left_alone(tmp_path):
-    (tmp_path / LOCK_FILE).write_text('{"pid": 7, "host": "node-12"}')
-    with pytest.raises(ValueError, match=r"process 7 on node-12: .*if that has ended, delete .*run\.lock"):
-        locked(tmp_path).__enter__()
-    assert "node-12" in (tmp_path / LOCK_FILE).read_text()
+def test_a_folder_made_for_the_lock_goes_with_it(tmp_path):
+    with locked(tmp_path / "run"):
+        assert (tmp_path / "run").is_dir()
+    assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("content", ["", "[" * 100_000, '{"pid": Infinity}'])
-def test_what_is_no_owner_is_taken_over(tmp_path, content):
-    (tmp_path / LOCK_FILE).write_text(content)
-    (tmp_path / "config.yaml").touch()
-    with locked(tmp_path), locked(tmp_path):
-        assert (tmp_path / LOCK_FILE).exists()
-    assert [file.name for file in tmp_path.iterdir()] == ["config.yaml"]
-
-
-def test_a_lock_that_is_a_link_or_a_pipe_is_refused(tmp_path):
+def test_a_lock_that_is_a_link_or_a_pipe_changes_no_other_file(tmp_path):
     (tmp_path / "precious").write_text("precious")
     (tmp_path / LOCK_FILE).symlink_to(tmp_path / "precious")
     with pytest.raises(OSError, match=LOCK_FILE):
         locked(tmp_path).__enter__()
     (tmp_path / LOCK_FILE).unlink()
     os.mkfifo(tmp_path / LOCK_FILE)
-    with pytest.raises(ValueError, match="no regular file"):
+    with contextlib.suppress(ValueError, OSError):
         locked(tmp_path).__enter__()
     assert (tmp_path / "precious").read_text() == "precious"
 
@@ -152,6 +143,6 @@ def test_two_resumptions_do_not_train_the_same_run(other, tmp_path):
     for number in range(12):
         Image.new("RGB", (32, 32), (20 * number, 0, 0)).save(tmp_path / f"{number}.png")
     images = read_images(tmp_path, 32)
-    with pytest.raises(ValueError, match=f"being written by process {other.pid}"):
+    with pytest.raises(ValueError, match="being written by another process"):
         train(resolve("small", ["image_size=32"]), images, tmp_path / "run", resume=True)
     assert [file.name for file in (tmp_path / "run").iterdir()] == [LOCK_FILE]
