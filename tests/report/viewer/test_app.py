@@ -2,7 +2,6 @@
 
 import io
 import json
-import socket
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,7 @@ from derender.data.synthetic import faces
 from derender.report.viewer.app import Application
 from derender.report.viewer.images import rendered_examples
 from derender.report.viewer.questions import CropRequest, Light, Place, Refused, ViewRequest
-from derender.report.viewer.server import BoundedProtocol, serving
+from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 from derender.scene.crop import Crop
 from derender.scene.ranges import SceneRanges
@@ -171,16 +170,6 @@ def test_several_visitors_at_once_get_their_own_answers(client):
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda name: client.post("/api/view", {"picture": name}).body, names * 5))
     assert together == alone * 5
-
-
-@pytest.mark.parametrize("sent", [b"", b"POST /api/pictures HTTP/1.1\r\nHost: 127.0.0.1\r\n"])
-def test_who_sends_no_head_is_not_waited_for(model, monkeypatch, sent):
-    monkeypatch.setattr(BoundedProtocol, "head_seconds", 0.3)
-    with serving(Application(Studio(model, "tiny", Shelf(2)))) as url:
-        place = ("127.0.0.1", int(url.rsplit(":", 1)[1].strip("/")))
-        with socket.create_connection(place, timeout=5) as connection:
-            connection.sendall(sent)
-            assert connection.recv(4096) == b""
 
 
 def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):

@@ -1,9 +1,8 @@
 """The addresses of the page and their answers, within bounds of size, time and number.
 
 Nothing in a request can name a file: the page's own files are read once at the start, images are known by
-names that the shelf made up, examples and rows by number. Bodies are read up to a limit, and all uploads
-together keep no more than another. Decoding and computing have one thread each: a heavy upload does not hold
-up the sliders of others.
+names that the shelf made up, examples and rows by number. Bodies are read up to a limit. Decoding and
+computing have one thread each: a heavy upload does not hold up the sliders of others.
 """
 
 import asyncio
@@ -41,15 +40,13 @@ from derender.report.viewer.questions import (
     read_request,
     too_large,
 )
-from derender.report.viewer.server import Body, Guard, Uploads
+from derender.report.viewer.server import Guard
 from derender.report.viewer.studio import Studio
 
 LONG_WORK = 6
 """Films and fits may take so many times as long as other answers."""
 
 REQUEST_LIMIT_BYTES = 10_000
-UPLOADS_LIMIT_BYTES = 10 * BODY_LIMIT_BYTES
-"""Of all uploads together that arrive or wait to be decoded."""
 
 WAITING_AT_MOST = 200
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
@@ -130,7 +127,6 @@ class Application:
         self.body_seconds, self.work_seconds = body_seconds, work_seconds
         self._computing = ThreadPoolExecutor(1, thread_name_prefix="view-compute")
         self._decoding = ThreadPoolExecutor(1, thread_name_prefix="view-decode")
-        self._uploads = Uploads(UPLOADS_LIMIT_BYTES)
         self._waiting = 0
         posts: dict[str, Answer] = {
             "/api/pictures": self.open_upload,
@@ -167,10 +163,8 @@ class Application:
 
     async def open_upload(self, request: Request) -> Response:
         """Decompose the image in the body."""
-        with self._uploads.one() as body:
-            await self._receive(request, body, BODY_LIMIT_BYTES)
-            photo = await self._work(self._decoding, lambda: photo_of(bytes(body.content)))
-        return await self._opened(photo)
+        content = await self._receive(request, BODY_LIMIT_BYTES)
+        return await self._opened(await self._work(self._decoding, photo_of, content))
 
     async def open_example(self, request: Request) -> Response:
         """Decompose one of the examples."""
@@ -225,28 +219,24 @@ class Application:
             self._waiting -= 1
 
     async def _question(self, request: Request, kind: type[Question]) -> Question:
-        body = Body()
-        await self._receive(request, body, REQUEST_LIMIT_BYTES)
-        return read_request(kind, bytes(body.content))
+        return read_request(kind, await self._receive(request, REQUEST_LIMIT_BYTES))
 
-    async def _receive(self, request: Request, body: Body, limit: int) -> None:
-        """Fill ``body``; ``Refused`` if it is too large (413), too slow (408) or had to make room (503)."""
+    async def _receive(self, request: Request, limit: int) -> bytes:
+        """The body of a request; ``Refused`` if it is too large (413) or too slow (408)."""
+        content, received = bytearray(), 0
         try:
             async with asyncio.timeout(self.body_seconds):
                 async for part in request.stream():
-                    body.take(part)
-                    if body.received > limit:
-                        body.drop()
-                    self._uploads.make_room()
-                    if body.received > limit + DRAINED_AT_MOST_BYTES:
+                    received += len(part)
+                    if received <= limit:
+                        content += part
+                    elif received > limit + DRAINED_AT_MOST_BYTES:
                         break
         except TimeoutError as late:
             raise Refused(408, "the file came too slowly: try again") from late
-        if body.received > limit:
+        if received > limit:
             raise too_large() if limit == BODY_LIMIT_BYTES else Refused(413, "this request is too long")
-        if body.dropped:
-            raise Refused(503, "too many files are arriving at once: try again in a moment")
-        body.whole = True
+        return bytes(content)
 
 
 async def _page_file(content: bytes, media_type: str, request: Request) -> Response:
@@ -255,7 +245,8 @@ async def _page_file(content: bytes, media_type: str, request: Request) -> Respo
 
 async def _problem(request: Request, problem: HTTPException | Refused | ClientDisconnect) -> Response:
     if isinstance(problem, Refused):
-        return JSONResponse({"error": problem.message}, problem.status)
+        ended = {"connection": "close"} if problem.status in (408, 413) else None  # its rest may never come
+        return JSONResponse({"error": problem.message}, problem.status, headers=ended)
     if isinstance(problem, HTTPException):  # no such address
         return JSONResponse({"error": problem.detail}, problem.status_code, headers=problem.headers)
     return Response(status_code=400)

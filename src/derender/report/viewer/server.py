@@ -1,32 +1,28 @@
-"""A listening socket and uvicorn on it; requests that it accepts, their bodies, the headers of its answers.
+"""A listening socket and uvicorn on it; requests that it accepts, and the headers of its answers.
 
-The socket is opened before anything slow is loaded, so that a port in use is one error at once. Time, size
-and the number of connections are bounded. A page on another site can make a visitor's browser send requests
-here. Three checks stop it. The Host header must name this machine and not a foreign name that was made to
-point here (DNS rebinding). A request that changes or computes something must come from the page itself
-(Origin, Sec-Fetch-Site) and carry a header that no form can send. No answer may be framed, embedded, sniffed
-or stored. Leaves out passwords: everyone who can reach the address can use the page.
+The socket is opened before anything slow is loaded, so that a port in use is one error at once. A page on
+another site can make a visitor's browser send requests here. Three checks stop it. The Host header must name
+this machine and not a foreign name that was made to point here (DNS rebinding). A request that changes or
+computes something must come from the page itself (Origin, Sec-Fetch-Site) and carry a header that no form can
+send. No answer may be framed, embedded, sniffed or stored. Leaves out passwords: everyone who can reach the
+address can use the page.
 """
 
-import asyncio
 import errno
 import ipaddress
 import logging
 import re
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from threading import Thread
 from typing import TYPE_CHECKING
 
-import h11
 import uvicorn
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 if TYPE_CHECKING:
     from derender.report.viewer.app import Application
@@ -126,62 +122,6 @@ def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
-@dataclass(eq=False)
-class Body:
-    """One body as it arrives: its kept content, all bytes received, and since when (a monotonic clock).
-
-    ``whole``: nothing more will come. ``dropped``: it made room for others, and nothing of it is kept.
-    """
-
-    content: bytearray = field(default_factory=bytearray)
-    received: int = 0
-    whole: bool = False
-    dropped: bool = False
-    began_s: float = field(default_factory=time.monotonic)
-
-    def take(self, part: bytes) -> None:
-        self.received += len(part)
-        if not self.dropped:
-            self.content += part
-
-    def drop(self) -> None:
-        self.dropped = True
-        self.content.clear()
-
-
-class Uploads:
-    """The uploads that arrive or wait to be decoded: at most ``limit_bytes`` of them all, in memory only.
-
-    No upload waits for another. Beyond the bound the slowest of those that still arrive is dropped, so that
-    one that stalls or trickles does not hold up the others.
-    """
-
-    def __init__(self, limit_bytes: int):
-        self.limit_bytes = limit_bytes
-        self._bodies: set[Body] = set()
-
-    @contextmanager
-    def one(self) -> Iterator[Body]:
-        """A body that counts meanwhile."""
-        body = Body()
-        self._bodies.add(body)
-        try:
-            yield body
-        finally:
-            self._bodies.remove(body)
-
-    @property
-    def kept_bytes(self) -> int:
-        return sum(len(body.content) for body in self._bodies)
-
-    def make_room(self) -> None:
-        """Drop the slowest that still arrive until the others fit; to be called after every part."""
-        while self.kept_bytes > self.limit_bytes:
-            later_s = time.monotonic() + 1e-6
-            arriving = (body for body in self._bodies if body.content and not body.whole)
-            min(arriving, key=lambda body: body.received / (later_s - body.began_s)).drop()
-
-
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket; port 0 takes any free one.
 
@@ -220,57 +160,12 @@ def address_of(listener: socket.socket, host: str) -> str:
     return f"http://{f'[{shown}]' if ':' in shown and not shown.startswith('[') else shown}:{port}/"
 
 
-class BoundedProtocol(H11Protocol):
-    """uvicorn's protocol, which also ends connections without head, with endless bodies, or that stall."""
-
-    head_seconds = 10.0
-    taking_seconds = 30.0
-    _head_timer: asyncio.TimerHandle | None = None
-    _taking_timer: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self._watch_head()
-
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
-        self._watch_head()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._head_timer, self._taking_timer = _ended(self._head_timer), _ended(self._taking_timer)
-        super().connection_lost(exc)
-
-    def on_response_complete(self) -> None:
-        super().on_response_complete()
-        if self.conn.their_state is h11.SEND_BODY:  # answered before its end, which may never come
-            self.transport.close()
-
-    def pause_writing(self) -> None:
-        super().pause_writing()
-        self._taking_timer = self.loop.call_later(self.taking_seconds, self.transport.abort)
-
-    def resume_writing(self) -> None:
-        self._taking_timer = _ended(self._taking_timer)
-        super().resume_writing()
-
-    def _watch_head(self) -> None:
-        if self.conn.their_state is not h11.IDLE:
-            self._head_timer = _ended(self._head_timer)
-        elif self._head_timer is None:
-            self._head_timer = self.loop.call_later(self.head_seconds, self.transport.close)
-
-
-def _ended(timer: asyncio.TimerHandle | None) -> None:
-    if timer is not None:
-        timer.cancel()
-
-
 def server_for(application: "Application") -> uvicorn.Server:
     """uvicorn with these bounds."""
     logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
     config = uvicorn.Config(
         application.guarded,
-        http=BoundedProtocol,
+        http="h11",
         ws="none",
         lifespan="off",
         log_config=None,
