@@ -56,7 +56,7 @@ def test_bad_words(model, rendered, tmp_path, refused):
     taken = tmp_path / "taken.png"
     taken.write_bytes(b"mine")
     assert "--force" in refused("--out", taken) and taken.read_bytes() == b"mine"
-    assert "is not one of 'lasso', 'trees', 'none'" in refused("--dimensions", "forest")
+    assert "is not one of 'lasso', 'none'" in refused("--dimensions", "forest")
     assert "needs 20 images or more" in refused("--limit", "5")
 
 

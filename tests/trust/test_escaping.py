@@ -10,9 +10,7 @@ from tests.report.test_page import Elements
 
 from derender.data import ImageSet, Skipped
 from derender.data.doctor import doctor
-from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.linear_task import Rows, task_of
-from derender.evaluation.robust import CurveResult, RobustnessComparison
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation import Explained, cluster_shares, explain_labels, pair_parts
 from derender.report import charts
@@ -20,7 +18,6 @@ from derender.report.comparison import comparison_page
 from derender.report.doctor import doctor_page
 from derender.report.explanation import explanation_page, share_chart
 from derender.report.page import Page
-from derender.report.protocols import robustness_page
 from derender.report.run import run_page
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run
@@ -73,17 +70,6 @@ def test_doctor(evil):
     labels = {evil: np.array([evil, "b"] * 12)}
     pictures = ImageSet(images, names, labels, source=evil, skipped=(Skipped(evil, evil),))
     harmless(doctor_page(doctor(pictures)), evil)
-
-
-@pytest.mark.parametrize("evil", EVIL)
-def test_robustness(evil):
-    drawn = np.linspace(-0.01, 0.01, 5)
-    named = {"ordinary": 0.9, "area": 0.7, "0 deg": 0.9, "40 deg": 0.5}
-    scores = {key: estimate([value - 0.1, value + 0.1], value + drawn) for key, value in named.items()}
-    rows = with_verdicts([ScoredRow(evil, False, 2, scores), ScoredRow(f"{evil} 2", True, 2, scores)])
-    curve = CurveResult("yaw", evil, (0.0, 40.0), (8, 8, 16), {"accuracy": rows})
-    result = RobustnessComparison((curve,), evil, "classes", (evil, "b"), "logistic", {"yaw": 19}, 3, (0, 1))
-    harmless(robustness_page(result, evil), evil)
 
 
 @pytest.mark.parametrize("evil", EVIL)

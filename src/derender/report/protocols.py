@@ -1,4 +1,4 @@
-"""Curves of accuracy over angle as a chart and a page; masks in colours over their images.
+"""Curves of accuracy over angle as a chart; masks in colours over their images.
 
 The chart has a panel for each axis. Controls are grey and dashed; the 95 % interval of the first features is
 shaded. Masks stand beside the answers of several networks, with a legend; left and right of a pair share a
@@ -17,12 +17,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from derender.evaluation.memory import content_hash
 from derender.evaluation.robust import CurveResult, RobustnessComparison
-from derender.evaluation.robust.compare import AREA, SCORES, level_name
+from derender.evaluation.robust.compare import SCORES, level_name
 from derender.evaluation.segmentation import SegmentationComparison
 from derender.report import colours
 from derender.report.charts import SERIES, side_by_side
 from derender.report.colours import Images
-from derender.report.page import Page, png_bytes
+from derender.report.page import png_bytes
 from derender.report.panel import INK, PAPER, GridLayout, labelled_grid, shortened
 from derender.storage.atomic import write_whole
 
@@ -55,30 +55,8 @@ def robustness_chart(result: RobustnessComparison, score: str = "accuracy") -> t
     return side_by_side(panels, draw, "degrees off the front", size, columns=5)
 
 
-def robustness_page(result: RobustnessComparison, model: str, score: str = "accuracy") -> Page:
-    """Chart and tables on one page."""
-    areas = [
-        f"{curve.title}: {row.name} has the area {row.scores[AREA].value:.3f}"
-        for curve in result.curves
-        for row in curve.rows[score]
-    ]
-    tables = result.tables(score)
-    own = {curve.title: tables[3 * at : 3 * at + 3] for at, curve in enumerate(result.curves)}
-    chart, score_name = robustness_chart(result, score)[0], SCORES[score].capitalize()
-    return Page(
-        "robustness.html",
-        "Robustness to light and view",
-        f"{result.how.capitalize()}: learned in ordinary light and view, asked in others.",
-        {"chart": chart, "alt": "; ".join(areas), "score": score_name, "tables": own},
-        f"Model: {model}. Definitions: docs/reference/metrics.md.",
-    )
-
-
-def write_curves(result: RobustnessComparison, score: str, model: str, file: Path) -> None:
-    """Write the chart (.svg, .png) or the page (.html)."""
-    if file.suffix.lower() == ".html":
-        robustness_page(result, model, score).write(file)
-        return
+def write_curves(result: RobustnessComparison, score: str, file: Path) -> None:
+    """Write the chart, .svg or .png."""
     svg, png = robustness_chart(result, score)
     write_whole(file, png if file.suffix.lower() == ".png" else svg.encode())
 

@@ -80,9 +80,8 @@ def test_rows_are_means_with_the_spread_over_seeds_below():
 
 def test_tables_against_the_true_factors():
     made = card()
-    truth, dimensions, single = made.tables()[3:]
+    truth, _, single = made.tables()[3:]
     assert truth.values()["model"]["placed"] == 1 and truth.values()["shuffled rows"]["I"] < 0.1
-    assert dimensions.values()["model"]["C, grouped"] > 0.9
     cells = single.values()["light yaw"]
     assert list(cells) == ["light", "camera", "all", "all, shuffled", "chance"]
     assert cells["light"] > 0.99 > 0.2 > cells["camera"] and cells["chance"] == 0

@@ -16,7 +16,7 @@ class CardImages(options.PartOfImages):
     limit: options.Limit = 2000
 
 
-DIMENSIONS = "Scores by dimension: lasso, trees (takes minutes), or none."
+DIMENSIONS = "Scores by dimension: lasso or none."
 
 
 def disentangle(
@@ -24,7 +24,7 @@ def disentangle(
     out: Path | None = option(None, "PNG file for all matrices.", "--out", "-o", metavar="FILE.png"),
     seeds: int = scoring.number(3, "Number of seeds.", max=20),
     swap_pictures: int = scoring.number(256, "Most images in the swap test.", min=2),
-    dimensions: Literal["lasso", "trees", "none"] = option("lasso", DIMENSIONS),
+    dimensions: Literal["lasso", "none"] = option("lasso", DIMENSIONS),
     batch_size: options.BatchSize = 64, seed: options.Seed = 0, cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""

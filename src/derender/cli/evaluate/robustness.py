@@ -9,7 +9,7 @@ from derender.cli.console import result
 from derender.cli.options import option
 
 PICTURES = "faces or cars: generated. render: IMAGES, re-rendered. truth: IMAGES of known angles."
-OUT = "Also draw the curves: .svg, .png, .html."
+OUT = "Also draw the curves: .svg, .png."
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def robustness(
     Images are generated, so that light and view are known; or IMAGES are re-rendered by the first model; or
     IMAGES have known angles.
     """
-    published.check_drawing(out, [".svg", ".png", ".html"])
+    published.check_drawing(out, [".svg", ".png"])
     shown = "balanced_accuracy" if score == "balanced" else score
     scores = scoring.measured(
         "robustness", scoring.single_paths(model, "--model"), images.optional_address, **images.how,
@@ -54,5 +54,5 @@ def robustness(
     if out is not None:
         from derender.report.protocols import write_curves
 
-        write_curves(scores.result, shown, ", ".join(model), out)
+        write_curves(scores.result, shown, out)
         result(f"curves in {out}", published.json_file)

@@ -70,8 +70,6 @@ _DIMENSIONS = {
     "truth.by_dimension.completeness": Column("C", note="one dimension holds a factor"),
     "truth.by_dimension.mig": _MIG,
     "truth.by_dimension.sap": Column("SAP", "high", note="gap of squared correlation"),
-    "truth.grouped_dci.0": Column("D, grouped", note="importances added up by feature"),
-    "truth.grouped_dci.1": Column("C, grouped", note="importances added up by feature"),
 }
 
 
@@ -215,8 +213,7 @@ def disentangle(
         images: an image set at the model's size, or the path of a data set; 20 images or more. Labels that
             are factors of a rendered scene (``true_factors``) bring the scores against ground truth.
         seeds: one result each.
-        dimensions: importances of the scores by dimension ("lasso", or "trees", which takes minutes); None
-            leaves them out.
+        dimensions: importances of the scores by dimension, "lasso"; None leaves these scores out.
         swap_images: at most so many images, a random subset for each seed, go through the swap test.
         batch_size: images at a time; changes speed and memory only.
         memory: cache of the scores of each row and seed.

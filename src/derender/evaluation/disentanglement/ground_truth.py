@@ -91,8 +91,8 @@ class GroundTruthScores:
     """F features against K true factors, by name.
 
     ``score`` is (F, K): held-out R2 of numbers, accuracy of classes, best 1; ``together`` (K,) that of all
-    features side by side, ``chance`` (K,) that of a constant answer. ``grouped_dci`` adds up importances of
-    dimensions by feature. ``placed`` is the share of factors that the right feature predicts best.
+    features side by side, ``chance`` (K,) that of a constant answer. ``placed`` is the share of factors that
+    the right feature predicts best.
     """
 
     features: tuple[str, ...]
@@ -102,7 +102,6 @@ class GroundTruthScores:
     chance: np.ndarray
     by_feature: ModularityScores
     by_dimension: ModularityScores | None
-    grouped_dci: tuple[float, float] | None
     placed: float
 
 
@@ -128,9 +127,11 @@ def ground_truth_scores(
 ) -> GroundTruthScores:
     """All scores of features by name, each (N, D), against two true factors or more of the same N images.
 
-    ``dimensions`` is the method of the importances of single dimensions: "lasso", fast, or "trees", slow;
-    None leaves their scores out. ``seed`` is of the predictions' folds and of the trees.
+    ``dimensions`` is the method of the importances of single dimensions, "lasso"; None leaves their scores
+    out. ``seed`` is of the predictions' folds.
     """
+    if dimensions not in (None, "lasso"):
+        raise ValueError(f"unknown method {dimensions!r} of dimensions: choose lasso or None")
     blocks = side_by_side(blocks)
     names, everything = tuple(blocks), np.concatenate(list(blocks.values()), axis=1)
     result = (_predicted(x, factors, seed) for x in (*blocks.values(), everything))
@@ -139,16 +140,14 @@ def ground_truth_scores(
     mig = float(np.mean([_information_gap(bins[:-1, k].T, factor) for k, factor in enumerate(factors)]))
     owned = [k for k, factor in enumerate(factors) if set(factor.belongs_to) & set(names)]
     right = [share[:, k].max() > 0 and names[share[:, k].argmax()] in factors[k].belongs_to for k in owned]
-    by_dimension = grouped = None
+    by_dimension = None
     if dimensions is not None:
-        weights, each = importance(everything, factors, dimensions, seed=seed), binned(everything)
+        weights, each = importance(everything, factors), binned(everything)
         single = np.stack([_explained(everything, factor) for factor in factors], axis=1)
         gaps = [_information_gap(each, factor) for factor in factors], _gap(single)
         by_dimension = ModularityScores(
             *dci(weights), informativeness, *(float(np.mean(one)) for one in gaps)
         )
-        starts = np.cumsum([0, *(values.shape[1] for values in blocks.values())])[:-1]
-        grouped = dci(np.add.reduceat(weights, starts, axis=0))
     return GroundTruthScores(
         names,
         tuple(factor.name for factor in factors),
@@ -157,32 +156,23 @@ def ground_truth_scores(
         np.array([factor.largest_share for factor in factors]),
         ModularityScores(*dci(share), informativeness, mig, float(np.mean(_gap(share)))),
         by_dimension,
-        grouped,
         sum(right) / len(owned) if owned else float("nan"),
     )
 
 
-def importance(codes: np.ndarray, factors: Sequence[TrueFactor], method: str, *, seed: int = 0) -> np.ndarray:
+def importance(codes: np.ndarray, factors: Sequence[TrueFactor]) -> np.ndarray:
     """(D, K) importance of each dimension of (N, D) codes for each of K factors; each column adds to 1.
 
-    Absolute weights of a "lasso" on standardised codes, added up over classes, or importances of gradient
-    boosted "trees", which ``seed`` belongs to. A column is 0 where no dimension helps. The lasso's penalty is
-    a fixed share of the largest useful one, so scaling codes or factors changes nothing; a rotation does.
+    Absolute weights of a lasso on standardised codes, added up over classes. A column is 0 where no dimension
+    helps. The penalty is a fixed share of the largest useful one, so scaling codes or factors changes
+    nothing; a rotation does.
     """
-    from sklearn.ensemble import GradientBoostingClassifier, GradientBoostingRegressor
-
-    if method not in ("lasso", "trees"):
-        raise ValueError(f"unknown method {method!r}: choose lasso or trees")
     deviation = codes.std(axis=0)
     alive = deviation > 1e-9 * np.abs(codes).max(axis=0, initial=0)
     standard = (codes[:, alive] - codes[:, alive].mean(axis=0)) / deviation[alive]
     result = np.zeros((codes.shape[1], len(factors)))
     for column, factor in enumerate(factors if alive.any() else []):
-        if method == "lasso":
-            weights = _lasso(standard, factor)
-        else:
-            kind = GradientBoostingClassifier if factor.is_class else GradientBoostingRegressor
-            weights = np.asarray(kind(random_state=seed).fit(standard, factor.values).feature_importances_)
+        weights = _lasso(standard, factor)
         result[alive, column] = weights / (weights.sum() or 1)
     return result
 
