@@ -1,5 +1,4 @@
-"""Tables from the command line: files and models in, scores beside controls and the paper's numbers out;
-`--whiten-on` adds controls with the model's whitening."""
+"""Tables from the command line: files and models in, scores beside controls and the paper's numbers out."""
 
 from pathlib import Path
 
@@ -9,7 +8,6 @@ from tests.cli.conftest import coloured_people
 
 from derender import Derenderer, FeatureTable
 from derender.cli import main
-from derender.data.synthetic import FaceSettings, faces, write
 
 ROWS = 64
 QUICK = ["--resamples", "20", "--untrained-seeds", "2", "--cache"]
@@ -141,19 +139,3 @@ def test_bad_input_is_one_line(tables, model, people, refused, tmp_path):
     assert "exists already" in refused(*compare, "--markdown", there)
     assert there.read_text() == "mine"
     assert "no feature table at" in refused(*compare, "-f", f"b={tmp_path / 'none.parquet'}")
-
-
-def test_controls_get_the_models_whitening(tmp_path, capsys, numbers):
-    net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
-    model, images = net.save(tmp_path / "model"), tmp_path / "faces"
-    write(faces.generate(32, 32, 0, FaceSettings(pictures_per_identity=8)), images)
-    words = ["evaluate", "cluster", images, "-m", model, "-l", "identity", "--whiten-on", images]
-    words += ["--resamples", "20", "--untrained-seeds", "1", "--cache", tmp_path / "cache"]
-    first, again = (numbers(*words)[0]["rows"] for _ in range(2))
-    assert first == again and {name: row["control"] for name, row in first.items()} == {
-        "geometry + albedo": False, "geometry + albedo, whitened here": False, "untrained encoder": True,
-        "PCA (8)": True, "pixels": True, "untrained encoder, whitened": True, "PCA (8), whitened": True,
-        "Gradientfaces": True, "HOG": True, "LBP": True, "majority": True, "chance": True,
-    }  # fmt: skip
-    assert main([*map(str, words)]) == 0
-    assert "0 results computed" in capsys.readouterr().err

@@ -227,7 +227,6 @@ def test_one_call_averages_caps_clusters_and_scores(tracks, tmp_path):
         (("wo", {}), "unknown label 'wo'; did you mean 'who'"),
         ((None, {}), "give either label"),
         (("who", {"factors": ("geometri",)}), "unknown factor 'geometri'"),
-        (("who", {"whiten_on": "x"}), "whiten_on needs a model"),
     ):
         with pytest.raises(ValueError, match=message):
             cluster(tracks, bad[0], **{**how, **bad[1]})

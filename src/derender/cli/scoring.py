@@ -36,10 +36,6 @@ Cache = Annotated[str | None, typer.Option(metavar="DIR", help=CACHE)]
 MASKS = "Folder or zip of masks named as the images, if they lie apart."
 Masks = Annotated[str | None, typer.Option(metavar="PATH", help=MASKS)]
 MODEL = f"Instead of --features, with IMAGES. {options.MODELS}"
-WHITEN_ON = (
-    "Also score the codes without whitening, and controls whitened by the model's renderings of these images "
-    "(best those of its training)."
-)
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,6 @@ class ScoredSubject:
     features: str | None = target("Table made by derender embed.", "--features", "-f", metavar="FILE.parquet")
     model: str | None = option(None, MODEL, "--model", "-m")
     factors: Factors = "geometry,albedo"
-    whiten_on: str | None = option(None, WHITEN_ON, metavar="PATH")
 
     def source(self, images: options.DataOptions) -> "FeatureSource":
         """The table, or the half of it that was asked for, or the model."""
@@ -79,7 +74,7 @@ class ScoredSubject:
     @property
     def how(self) -> dict[str, Any]:
         """Keywords of library calls."""
-        return {"factors": names_of(self.factors), "whiten_on": self.whiten_on}
+        return {"factors": names_of(self.factors)}
 
 
 @dataclass(frozen=True)

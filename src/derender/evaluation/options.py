@@ -27,8 +27,6 @@ class Options:
             and untrained encoder to compare with.
         factors: features to use, side by side; None means all.
         untrained_seeds: number of untrained encoders to average over.
-        whiten_on: also score the model without whitening, and controls whitened by its renderings of these
-            images.
         resamples: bootstrap resamples of the rows.
         seed: the first seed of every random choice: resamples, subsets, k-means, untrained encoders.
         keep_duplicates: of identical images keep every one.
@@ -43,7 +41,6 @@ class Options:
     images: ImageSet | str | Path | None = None
     factors: Sequence[str] | None = DEFAULT_FACTORS
     untrained_seeds: int = 3
-    whiten_on: ImageSet | str | Path | None = None
     resamples: int = RESAMPLES
     seed: int = 0
     keep_duplicates: bool = False

@@ -9,7 +9,7 @@ Fitting: a morphable model of the predicted depths and albedos, within which pos
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import torch
 from jaxtyping import Float, Int64, Shaped
@@ -41,9 +41,6 @@ TURNS = PerturbSettings(camera_pitch_deg=6, camera_yaw_deg=12)  # of photographs
 GREY = 0.4  # share of photographs without colour
 DARKEST = 0.1  # shading by which an image is divided, at least
 LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinates, where features hold them
-
-Describe = Callable[[Float[Tensor, "n 3 h w"]], Mapping[str, Float[Tensor, "n _"]]]
-"""Activations by name of images in 0..1: the code, then the rest."""
 
 
 def make_features(
@@ -90,15 +87,12 @@ def fit_brightness(model: Derenderer, images: Shaped[Tensor, "n 3 h w"]) -> Brig
 @torch.no_grad()
 def fit_whitening(
     model: Derenderer, images: Shaped[Tensor, "n 3 h w"], settings: WhiteningSettings,
-    perturb: PerturbSettings, *, describe: Describe | None = None, size: int | None = None, seed: int = 0,
-    progress: Progress | None = None,
+    perturb: PerturbSettings, *, size: int | None = None, seed: int = 0, progress: Progress | None = None,
 ) -> Whitening:  # fmt: skip
     """The map from a trained model's activations to its features; arguments as of `make_features`.
 
-    ``describe`` is another encoder, all of whose activations of the model's renderings are measured; by
-    default it is the model's own of geometry and albedo. ``size`` is that of the features, by default the
-    code's, or of all activations of ``describe``. Fewer than two images, or activations that are not finite,
-    are a ValueError.
+    ``size`` is that of the features, by default the code's. Fewer than two images, or activations that are
+    not finite, are a ValueError.
     """
     generator = Generator().manual_seed(seed)
     others = Generator().manual_seed(seed)  # of the vector factors: it changes no other feature
@@ -112,7 +106,8 @@ def fit_whitening(
         gradients = {f.name: settings.gradients and f.parameter == "albedo" for f in maps}
         return {name: model.factor_activations(name, batch, own) for name, own in gradients.items()}
 
-    encode = describe or (activated if settings.spatial else model.encode)
+    encode = activated if settings.spatial else model.encode
+    names = tuple(factor.name for factor in maps)
     mirrored: dict[str, Scatter] = {}
     alone: dict[str, Scatter] = {}
     with evaluating(model):
@@ -125,7 +120,6 @@ def fit_whitening(
             views = [encode(one) for one in shown]
             if settings.mirrored:
                 views += [encode(one.flip(-1)) for one in shown]
-            names = tuple(views[0]) if describe is not None else tuple(factor.name for factor in maps)
             for view in views:  # the images first: of a broken rendering every activation is broken
                 _check_finite(
                     "whitening", {f"the activations of {name}": view[name] for name in names}, start
@@ -133,14 +127,13 @@ def fit_whitening(
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
                 mirrored.setdefault(name, Scatter()).add(joined)
-            exchangeable = len(batch) > 1 and describe is None and settings.vectors
+            exchangeable = len(batch) > 1 and settings.vectors
             for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
                 shown = _renderings(model, scene, batch, rest, perturb, others, settings.views)
                 codes = [model.nets[factor.name].encoder(one).float() for one in shown]  # type: ignore[operator]
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
-    if describe is None:
-        size = size or model.settings.network.code_size
+    size = size or model.settings.network.code_size
     shrinkage, power = settings.shrinkage, settings.vector_power
     projections = {
         name: fit_projection(scatter, settings.directions, shrinkage, size, settings.evenness)
