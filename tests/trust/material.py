@@ -25,7 +25,6 @@ from derender.training.config import WhiteningSettings, resolve, to_yaml
 from derender.training.features import fit_whitening
 
 UNTIMED = ("metrics.jsonl", "environment.json", "state.json", "checksums.json", "report.html", "run.lock")
-UNTIMED += ("clustering.md", "clustering.tex", "clustering.html")
 """Files that hold times or checksums of such."""
 APART = {"cache", "tensorboard", "samples", "previous", "jobs", "logs"}
 PLAN = """

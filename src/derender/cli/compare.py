@@ -43,13 +43,11 @@ def compare(
     rest = (images, paper, replace(computed, device="auto"), replace(published, json_file=None))
     if planned.plan is not None:
         if rest != (options.DataOptions(), PaperTable(), scoring.Computed(), scoring.Published()):
-            raise ValueError(
-                "beside --plan go --out, --workers, --minutes, --dry-run, --device, --json alone"
-            )
+            raise ValueError("beside --plan go --out, --dry-run, --device, --json alone")
         by_plan(planned, computed.device, published.json_file)
         return
     if planned != Planned():
-        raise ValueError("--out, --workers, --minutes and --dry-run go with --plan FILE")
+        raise ValueError("--out and --dry-run go with --plan FILE")
     if paper.table is None:
         raise ValueError("give --table NAME with --model or --features, or --plan FILE with --out DIR")
     from derender.features import FeatureTable

@@ -2,8 +2,8 @@
 
 import pytest
 
-from derender.learn.jobs import jobs_of
 from derender.learn.plan import Plan, read_plan
+from derender.learn.sweep import jobs_of
 
 GOOD = """
 images: 1000
@@ -54,9 +54,9 @@ def test_jobs_share_trainings_and_come_after_what_they_need(read):
     embeddings = [job for job in jobs if job.kind == "embed" and job.where == "lfw"]
     wanted = [(name, seed) for name in ("ours", "codes", "small vqvae") for seed in (0, 1)]
     assert [(job.method, job.seed) for job in embeddings] == [*wanted, ("hog", 0)]
-    assert embeddings[0].after == embeddings[2].after  # codes are of the same runs
+    assert embeddings[0].training == embeddings[2].training  # codes are of the same runs
     for place, job in enumerate(jobs):
-        assert all(one in jobs[:place] for one in job.after)
+        assert job.training is None or job.training in jobs[:place]
 
 
 def test_toml_says_the_same(read):
@@ -68,7 +68,7 @@ label = "identity"
 """
     plan = read(text, "plan.toml")
     assert plan.score["lfw"].label == ("identity",)
-    assert [job.kind for job in jobs_of(plan)] == ["embed", "score"]
+    assert [job.kind for job in jobs_of(plan)] == ["embed"]
 
 
 @pytest.mark.parametrize(
