@@ -19,6 +19,7 @@ class Planned:
     out: Path | None = option(None, OUT, "--out", "-o", metavar="DIR", **PANEL)
     dry_run: bool = option(False, "List the jobs of --plan, and stop.", "--dry-run", **PANEL)
     workers: int | None = option(None, None, hidden=True)  # of earlier commands; jobs follow one another
+    minutes: float | None = option(None, None, hidden=True)  # likewise: a stopped plan continues
 
 
 def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
