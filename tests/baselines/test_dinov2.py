@@ -5,9 +5,9 @@ import pickle
 
 import pytest
 import torch
+import transformers
 from tests.trust.test_no_code import Bomb
 from torch.nn.functional import interpolate
-from transformers import Dinov2Config, Dinov2Model, ViTConfig, ViTModel
 
 from derender.baselines.dinov2 import IMAGENET_MEAN, IMAGENET_STD, Dinov2
 
@@ -18,7 +18,8 @@ TINY |= {"image_size": 28, "patch_size": 14}
 @pytest.fixture(scope="module")
 def dinov2(tmp_path_factory, seeded):
     """A tiny DINOv2 with random weights in a folder, and the network itself."""
-    folder, net = tmp_path_factory.mktemp("dinov2"), seeded(Dinov2Model, Dinov2Config(**TINY)).eval()
+    folder = tmp_path_factory.mktemp("dinov2")
+    net = seeded(transformers.Dinov2Model, transformers.Dinov2Config(**TINY)).eval()
     net.save_pretrained(folder)
     return folder, net
 
@@ -43,9 +44,9 @@ def test_other_weights_than_a_dinov2_in_one_safetensors_file_are_refused(dinov2,
     pickled, other, deeper, parts = (tmp_path / name for name in ("pickled", "other", "deeper", "parts"))
     net.config.save_pretrained(pickled)
     (pickled / "pytorch_model.bin").write_bytes(pickle.dumps(Bomb(tmp_path / "it-ran")))
-    ViTModel(ViTConfig(**TINY, intermediate_size=8)).save_pretrained(other)
+    transformers.ViTModel(transformers.ViTConfig(**TINY, intermediate_size=8)).save_pretrained(other)
     net.save_pretrained(deeper)
-    Dinov2Config(**{**TINY, "num_hidden_layers": 3}).save_pretrained(deeper)
+    transformers.Dinov2Config(**{**TINY, "num_hidden_layers": 3}).save_pretrained(deeper)
     net.config.save_pretrained(parts)  # an index of shards, which could name files outside the folder
     names = dict.fromkeys(net.state_dict(), "../deeper/model.safetensors")
     (parts / "model.safetensors.index.json").write_text(json.dumps({"metadata": {}, "weight_map": names}))

@@ -36,7 +36,8 @@ def test_the_example_goes_through_every_command(made):
     assert run("swap", *source, image, "--from", other, "--out", folder / "s") == 0
     moved = json.loads((folder / "s" / image.stem / "moved.json").read_text())
     assert "its white" in [still["label"] for still in moved["stills"]]
-    assert run("relight", *source, image, "--like", other, "--out", folder / "r") == 0
+    still = ("--film", "none", "--stills", "2")
+    assert run("relight", *source, image, "--like", other, "--out", folder / "r", *still) == 0
     copy = whiten(model, folder / "data", out=folder / "w", settings={"whitening.pictures": 8, "examples": 8})
     assert "white" in copy.scores["between_over_within"]
     with pytest.raises(ValueError, match="made with the renderer '05_new_factor:BALANCE', not 'lambert'"):

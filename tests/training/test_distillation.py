@@ -123,7 +123,7 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_distilled_so_steps_back_from_smaller_faces(model, images):
-    lessons = framed(images=480, rendered=0, fit_steps=4)
+    lessons = framed(images=240, rendered=0, fit_steps=4, learning_rate=1.5e-3)
     learned = distillation.refine(model, images, images, lessons, seed=5).model
     assert learned.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
@@ -143,7 +143,7 @@ def test_further_factors_are_learnt_too(renderer):
     start = Derenderer.from_preset("small", seed=0, renderer=renderer, **sizes).eval().requires_grad_(False)
     how = SHORT.model_copy(update=FeatureSettings(**settings).__dict__)
     start = make_features(start, images, how)
-    refined = distillation.refine(start, images, images, changed(images=400), seed=5)
+    refined = distillation.refine(start, images, images, changed(images=200, learning_rate=1e-3), seed=5)
     extra = {row.parameter for row in start.factors} - {"depth", "albedo", "light", "camera"}
     assert extra and {row.parameter for row in start.factors} == set(refined.gaps)
     assert all(refined.gaps[name]["now"] < 0.9 * refined.gaps[name]["before"] for name in extra)

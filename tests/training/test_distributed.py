@@ -24,7 +24,7 @@ TINY = [
     *("image_size=32", "width=8", "light_width=4", "batch_size=8"),
     *("perceptual=self", "self_features_steps=2"),
     *("validate_every=16", "checkpoint_every=16", "learning_rate=1e-4", "warmup_images=0", "final_rate=1"),
-    "loocc=light+camera",
+    *("loocc=light+camera", "whitening.pictures=8", "whitening.spatial=false", "directions=8"),
 ]
 
 

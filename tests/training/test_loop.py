@@ -29,7 +29,7 @@ from derender.training.task import Progress
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning_rate=1e-3"]
-TINY += ["warmup_images=0", "final_rate=1"]
+TINY += ["warmup_images=0", "final_rate=1", "whitening.pictures=0", "fitting.examples=0"]
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
         return Image.fromarray((model.reconstruct(images).image[0, 0].clamp(0, 1) * 255).byte().numpy())
 
     seen: list[Progress] = []
-    config = resolve("small", [*TINY, "images=128"])
+    config = resolve("small", [*TINY, "images=128", "whitening.pictures=16"])
     result = train(config, pictures, tmp_path / "run", sample_sheet=sheet, progress=seen.append)
     run = tmp_path / "run"
     assert result.stopped == "images"
@@ -146,7 +146,7 @@ def worsening(pictures, tmp_path_factory):
     return folder, result
 
 
-WORSENING = [*TINY, "images=96", "learning_rate=0.03", "watch=false", "whitening.pictures=0"]
+WORSENING = [*TINY, "images=96", "learning_rate=0.03", "watch=false"]
 
 
 def model_of(run) -> dict[str, torch.Tensor]:
@@ -208,7 +208,7 @@ def test_a_run_without_held_out_pictures_keeps_its_last_weights(pictures, tmp_pa
 
 
 def test_minutes_end_a_run(pictures, tmp_path):
-    result = train(resolve("small", [*TINY, "images=1000000", "minutes=0.02"]), pictures, tmp_path / "run")
+    result = train(resolve("small", [*TINY, "images=1000000", "minutes=0.01"]), pictures, tmp_path / "run")
     assert result.stopped == "minutes"
     assert (tmp_path / "run" / "checkpoints" / "last").is_dir()
 

@@ -100,8 +100,8 @@ def test_the_decoder_is_saved_with_the_copy(distilled, images, tmp_path):
 
 def test_it_learns_what_the_model_predicts():
     model = derender.load("rendered-faces-64")
-    images = torch.from_numpy(faces.generate(24, image_size=64, seed=9).images)
-    settings = unets.UNetSettings(images=720, batch_size=12, unet_width=4, learning_rate=5e-3)
+    images = torch.from_numpy(faces.generate(16, image_size=64, seed=9).images)
+    settings = unets.UNetSettings(images=480, batch_size=8, unet_width=4, learning_rate=5e-3)
     distilled = unets.distil_unets(model, images, settings)
     hardly = unets.distil_unets(model, images, settings.model_copy(update={"images": 16}))
     assert distilled.errors["place"] < 0.75 * hardly.errors["place"]

@@ -334,7 +334,7 @@ def test_members_that_unpack_to_much_are_judged_by_their_header(tmp_path):
     zeros, whole = bytes(66 << 20), encoded(smooth(1))
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("good.png", whole)
-        for number in range(3):
+        for number in range(2):
             archive.writestr(f"zeros {number}.png", zeros)
         archive.writestr("long.png", whole + zeros)
     tracemalloc.start()
@@ -345,7 +345,7 @@ def test_members_that_unpack_to_much_are_judged_by_their_header(tmp_path):
         tracemalloc.stop()
     assert images.files == ("good.png",)
     reasons = {row.file: row.reason for row in images.skipped}
-    assert len(reasons) == 4 and reasons["long.png"] == "66 MiB of 48 x 40 pixels"
+    assert len(reasons) == 3 and reasons["long.png"] == "66 MiB of 48 x 40 pixels"
 
 
 @pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])

@@ -70,18 +70,18 @@ for one in (
     edits.swap, decompose.mesh, search.search, view.view, synth, bench.bench,
 ):  # fmt: skip
     one.register(app)
+_command = typer.main.get_command(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; gives the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        command = typer.main.get_command(app)
         with (
-            command.make_context("derender", arguments) as context,  # typer's own main hides what Ctrl-C said
+            _command.make_context("derender", arguments) as context,  # typer's main hides what Ctrl-C said
             damage_as_notices(),
         ):
-            command.invoke(context)
+            _command.invoke(context)
         sys.stdout.flush()
         return 0
     except typer.Exit as end:

@@ -35,7 +35,8 @@ def rendered() -> np.ndarray:
 @pytest.fixture(scope="module")
 def address(rendered) -> Iterator[str]:
     model = load("rendered-faces-64")
-    made = {"fit_steps": model.fitting.settings.steps}
+    model = model.with_features(model.features.with_steps(8))
+    made = {"fit_steps": 8}
     table = FeatureTable(("a<b>.png", "b.png", "c.png"), embed_images(model, rendered), {}, made)
     examples = [Example(f"<i>face</i> {at}", one.transpose(1, 2, 0)) for at, one in enumerate(rendered)]
     studio = Studio(model, "rendered-faces-64", Shelf(3), examples, Gallery(table))
@@ -141,7 +142,7 @@ def test_drop_a_file_drag_a_slider_save(page, rendered):
     assert saved(page, "gif")[1].startswith(b"GIF8")
 
 
-def test_the_result_is_dragged_compared_and_reset(page):
+def test_the_result_is_dragged_compared_and_reset_and_the_surface_turned(page):
     at_rest(page)
     original = pixels(page, "#view-sheet")
     box = page.locator("#view").bounding_box()
@@ -162,65 +163,8 @@ def test_the_result_is_dragged_compared_and_reset(page):
     page.click("#reset")
     page.locator("#compare").fill("0")
     assert page.locator("#sun").is_hidden()
+    at_rest(page)
 
-
-def test_a_crop_is_moved_by_mouse_and_keys_and_a_new_picture_resets_swaps(page, rendered):
-    page.click("#examples-second button:nth-child(2)")
-    page.check("#swaps [name=geometry]")
-    large = np.pad(rendered[0].repeat(3, 1).repeat(3, 2), ((0, 0), (40, 60), (80, 120)), mode="edge")
-    dropped(page, "large.png", png(large))
-    assert not page.is_checked("#swaps [name=geometry]")
-    page.locator("#photo-sheet").scroll_into_view_if_needed()
-    left = page.eval_on_selector("#crop", "element => element.offsetLeft")
-    ready = page.get_attribute("body", "data-ready")
-    box = page.locator("#crop").bounding_box()
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] / 2 + 20, box["y"] + box["height"] / 2, steps=3)
-    page.mouse.up()
-    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
-    assert page.eval_on_selector("#crop", "element => element.offsetLeft") == left + 20
-    assert page.input_value("#framing") == "own"
-    ready, width = page.get_attribute("body", "data-ready"), box["width"]
-    page.focus("#crop")
-    page.keyboard.press("+")
-    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
-    assert page.locator("#crop").bounding_box()["width"] > width
-    ready = page.get_attribute("body", "data-ready")
-    page.select_option("#framing", "none")
-    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
-    assert page.input_value("#framing") == "none"
-
-
-def test_effects_of_a_renderer_have_sliders(browser, rendered):
-    plain = load("rendered-faces-64")
-    settings = plain.settings.model_copy(update={"renderer": "phong+lambert-shadow+haze"})
-    model = Derenderer.seeded(settings, 0)
-    model.load_state_dict(model.state_dict() | plain.state_dict())
-    examples = [Example("face", rendered[0].transpose(1, 2, 0))]
-    with serving(Application(Studio(model.eval(), "glossy", Shelf(3), examples))) as url:
-        shown = begun(browser)
-        shown.goto(url)
-        shown.wait_for_selector("body[data-ready]")
-        at_rest(shown)
-        assert shown.locator("#numbers-sliders input").count() == 4
-        for name in ("highlight", "cast shadow", "transmission"):
-            assert shown.locator(f'[id="map-{name}"]').get_attribute("src")
-        before = pixels(shown, "#view-sheet")
-        for name in ("numbers-haze-airlight", "numbers-haze-beta"):
-            shown.focus(f"#{name}")
-            shown.keyboard.press("End")
-            at_rest(shown)
-        assert (pixels(shown, "#view-sheet") - before).mean() > 5  # paler
-        with zipfile.ZipFile(io.BytesIO(saved(shown, "archive")[1])) as archive:
-            assert json.loads(archive.read("settings.json"))["numbers"]["haze"] == pytest.approx([4, 1])
-        shown.click("#reset")
-        at_rest(shown)
-        assert np.abs(pixels(shown, "#view-sheet") - before).mean() < 1
-        shown.context.close()
-
-
-def test_orbit_swap_and_neighbours_by_keyboard(page):
     assert page.eval_on_selector("#surface", "element => element.dataset.drawn") == "webgl"
     page.locator("#surface").scroll_into_view_if_needed()
     page.wait_for_timeout(300)
@@ -251,7 +195,33 @@ def test_orbit_swap_and_neighbours_by_keyboard(page):
     assert page.locator("#near-rows b, #examples i").count() == 0  # names are text
 
 
-def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
+def test_a_crop_is_moved_a_new_picture_resets_swaps_and_what_is_wrong_is_said(page, rendered):
+    page.click("#examples-second button:nth-child(2)")
+    page.check("#swaps [name=geometry]")
+    large = np.pad(rendered[0].repeat(3, 1).repeat(3, 2), ((0, 0), (40, 60), (80, 120)), mode="edge")
+    dropped(page, "large.png", png(large))
+    assert not page.is_checked("#swaps [name=geometry]")
+    page.locator("#photo-sheet").scroll_into_view_if_needed()
+    left = page.eval_on_selector("#crop", "element => element.offsetLeft")
+    ready = page.get_attribute("body", "data-ready")
+    box = page.locator("#crop").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2 + 20, box["y"] + box["height"] / 2, steps=3)
+    page.mouse.up()
+    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
+    assert page.eval_on_selector("#crop", "element => element.offsetLeft") == left + 20
+    assert page.input_value("#framing") == "own"
+    ready, width = page.get_attribute("body", "data-ready"), box["width"]
+    page.focus("#crop")
+    page.keyboard.press("+")
+    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
+    assert page.locator("#crop").bounding_box()["width"] > width
+    ready = page.get_attribute("body", "data-ready")
+    page.select_option("#framing", "none")
+    page.wait_for_selector(f'body:not([data-ready="{ready}"])')
+    assert page.input_value("#framing") == "none"
+
     wrong = {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"<svg onload=alert(1)>"}
     page.set_input_files("#file", wrong)
     page.wait_for_selector("#status.wrong")
@@ -264,17 +234,44 @@ def test_what_is_wrong_is_said_and_the_page_goes_on(page, rendered):
     assert "no longer stored" not in page.inner_text("#status")
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (820, 1180), (1280, 900)])
-def test_it_fits_every_width_and_follows_the_dark(browser, address, width, height):
-    size = {"width": width, "height": height}
-    shown = begun(browser, viewport=size, color_scheme="dark", has_touch=width < 1000)
+def test_effects_of_a_renderer_have_sliders(browser, rendered):
+    plain = load("rendered-faces-64")
+    settings = plain.settings.model_copy(update={"renderer": "phong+lambert-shadow+haze"})
+    model = Derenderer.seeded(settings, 0)
+    model.load_state_dict(model.state_dict() | plain.state_dict())
+    examples = [Example("face", rendered[0].transpose(1, 2, 0))]
+    with serving(Application(Studio(model.eval(), "glossy", Shelf(3), examples))) as url:
+        shown = begun(browser)
+        shown.goto(url)
+        shown.wait_for_selector("body[data-ready]")
+        at_rest(shown)
+        assert shown.locator("#numbers-sliders input").count() == 4
+        for name in ("highlight", "cast shadow", "transmission"):
+            assert shown.locator(f'[id="map-{name}"]').get_attribute("src")
+        before = pixels(shown, "#view-sheet")
+        for name in ("numbers-haze-airlight", "numbers-haze-beta"):
+            shown.focus(f"#{name}")
+            shown.keyboard.press("End")
+            at_rest(shown)
+        assert (pixels(shown, "#view-sheet") - before).mean() > 5  # paler
+        assert json.loads(saved(shown, "settings")[1])["numbers"]["haze"] == pytest.approx([4, 1])
+        shown.click("#reset")
+        at_rest(shown)
+        assert np.abs(pixels(shown, "#view-sheet") - before).mean() < 1
+        shown.context.close()
+
+
+def test_it_fits_every_width_and_follows_the_dark(browser, address):
+    shown = begun(browser, viewport={"width": 390, "height": 844}, color_scheme="dark", has_touch=True)
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
-    wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-    assert shown.evaluate(wide) == 0
-    for name in ("#photo-sheet", "#view-sheet"):  # input and result are seen without scrolling
-        box = shown.locator(name).bounding_box()
-        assert box["y"] > 0 and box["y"] + box["height"] <= height and box["width"] > 100
+    for width, height in ((390, 844), (820, 1180), (1280, 900)):
+        shown.set_viewport_size({"width": width, "height": height})
+        wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+        assert shown.evaluate(wide) == 0
+        for name in ("#photo-sheet", "#view-sheet"):  # input and result are seen without scrolling
+            box = shown.locator(name).bounding_box()
+            assert box["y"] > 0 and box["y"] + box["height"] <= height and box["width"] > 100
     assert shown.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 22, 26)"
     shown.context.close()
 
