@@ -23,7 +23,7 @@ from derender.training.features import fit_whitening
 
 NETWORK = ["image_size=32", "width=8", "light_width=4", "code_size=16"]
 BRIEF = ["perceptual=none", "batch_size=8", "checkpoint_every=16", "validate_every=16", "warmup_images=0"]
-BRIEF += ["final_rate=1", "deterministic=true"]
+BRIEF += ["final_rate=1", "deterministic=true", "whitening.pictures=0", "fitting.examples=0"]
 
 
 @pytest.fixture(scope="module")
