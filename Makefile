@@ -9,7 +9,7 @@ JOBS ?= $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2); [ $$n -gt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test docs results release format bench constraints clean
+.PHONY: help setup demo test docs results published release format bench constraints clean
 
 help:  ## list the commands
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "%-18s%s\n", $$1, $$2}'
@@ -33,7 +33,7 @@ release: $(STAMP)  ## licences and known advisories of every package, into build
 # stopped run goes on where it was. `make results RESULTS=folder` leaves the files of the repository alone.
 RESULTS := benchmarks/results/generated
 DATA := build/results
-SCORES := heads brightness people cars-clusters cars-geometry
+SCORES := heads heads-fitted brightness people cars-clusters cars-geometry
 results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
 	@$(BIN)/python docs/pages.py
 
@@ -41,6 +41,7 @@ $(DATA)/%: | $(STAMP)
 	@rm -rf $@.part; $(BIN)/derender synth $* --benchmark --out $@.part && mv $@.part $@
 
 HEADS := evaluate geometry $(DATA)/faces/test --model rendered-faces-64
+HEADS-FITTED := $(HEADS) --fit-steps 60
 BRIGHTNESS := evaluate brightness $(DATA)/faces/test --model rendered-faces-64
 PEOPLE := evaluate cluster $(DATA)/faces/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
 CARS-CLUSTERS := evaluate cluster $(DATA)/cars/test --model cars-64 --label class
@@ -48,6 +49,8 @@ CARS-GEOMETRY := evaluate geometry $(DATA)/cars/test --model cars-64
 SCORE = @$(BIN)/python benchmarks/score.py $@
 $(RESULTS)/heads.json: | $(DATA)/faces
 	$(SCORE) $(HEADS)
+$(RESULTS)/heads-fitted.json: | $(DATA)/faces
+	$(SCORE) $(HEADS-FITTED)
 $(RESULTS)/brightness.json: | $(DATA)/faces
 	$(SCORE) $(BRIGHTNESS)
 $(RESULTS)/people.json: | $(DATA)/faces
@@ -56,6 +59,25 @@ $(RESULTS)/cars-clusters.json: | $(DATA)/cars
 	$(SCORE) $(CARS-CLUSTERS)
 $(RESULTS)/cars-geometry.json: | $(DATA)/cars
 	$(SCORE) $(CARS-GEOMETRY)
+
+# Results on sets that come from their owners: lfw64.zip, utkface64.zip and celeba64.zip in IMAGES, aligned, 64 pixels.
+PUBLISHED := benchmarks/results/published
+LFW := --label identity --min-count 20 --max-count 20
+published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make published IMAGES=folder (an hour, resumable)
+	@mkdir -p build; test -f build/lfw-fitted.parquet || $(BIN)/derender embed $(IMAGES)/lfw64.zip --model faces-64 \
+	  --fit-steps 60 --keep-duplicates --out build/lfw-fitted.parquet
+	@for step in "lfw evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW)" \
+	  "lfw-fitted evaluate cluster --features build/lfw-fitted.parquet $(LFW)" \
+	  "lfw-finch evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW) --method finch" \
+	  "disentanglement-lfw evaluate disentangle $(IMAGES)/lfw64.zip --model faces-64 --limit 800 --seeds 2" \
+	  "reconstruction-utkface evaluate reconstruction $(IMAGES)/utkface64.zip --model faces-64 --part test" \
+	  "reconstruction-lfw evaluate reconstruction $(IMAGES)/lfw64.zip --model faces-64 --limit 800" \
+	  "reconstruction-lfw-fitted evaluate reconstruction $(IMAGES)/lfw64.zip --model faces-64 --limit 800 --fit-steps 60" \
+	  "races evaluate cluster $(IMAGES)/utkface64.zip --model faces-64 --limit 4000 --label race --resamples 200" \
+	  "celeba-labels evaluate linear $(IMAGES)/celeba64.zip --model faces-64 --attributes --heads linear,centred,logistic --resamples 200 --seeds 1" \
+	  "celeba evaluate cluster $(IMAGES)/celeba64.zip --model faces-64 --attributes --resamples 200"; do \
+	  set -- $$step; name=$$1; shift; $(BIN)/python benchmarks/score.py $(PUBLISHED)/$$name.json "$$@" || exit 1; \
+	done; $(BIN)/python docs/pages.py
 
 format: $(STAMP)  ## ruff: formatting and the fixes it is sure of
 	@$(BIN)/ruff format . && $(BIN)/ruff check --fix .

@@ -210,6 +210,73 @@ def million_rows(result: Any) -> Iterator[list[str]]:
     yield from ([name, f"{result['seconds'][key]:.2f}"] for key, name in names.items())
 
 
+def with_steps(read: Callable[[Any], Iterator[list[str]]], file: str) -> Callable[[Any], Iterator[list[str]]]:
+    """The rows of a table, above them its first row with 60 steps per image, from a file of its own."""
+
+    def both(result: Any) -> Iterator[list[str]]:
+        head, *rows = read(result)
+        _, first, *_ = read(json.loads((RESULTS / file).read_text()))
+        yield from (head, [f"{first[0]}, 60 steps per image", *first[1:]], *rows)
+
+    return both
+
+
+def side_by_side(heads: Mapping[str, str], key: str) -> Callable[[Any], Iterator[list[str]]]:
+    """One score of the same rows in several files of benchmarks/results/published, by the head of each."""
+
+    def read(_: Any) -> Iterator[list[str]]:
+        yield ["", *heads]
+        files = [json.loads((RESULTS / "published" / f"{name}.json").read_text()) for name in heads.values()]
+        for name, row in files[0]["rows"].items():
+            note = " (control)" if row["control"] else ""
+            shown = (file["rows"][name]["scores"][key]["value"] for file in files)
+            yield [name + note, *(f"{value:.3f}" for value in shown)]
+
+    return read
+
+
+def probed(result: Any) -> Iterator[list[str]]:
+    """Balanced accuracy of each probe and number of labels."""
+    names = [name for name in result["parts"][0]["rows"] if name not in ("majority", "chance")]
+    yield ["probe, labels", *(name if name == names[0] else f"{name} (control)" for name in names)]
+    for part in result["parts"]:
+        scores = (part["rows"][name]["scores"]["balanced_accuracy"]["value"] for name in names)
+        yield [f"{part['head']}, {part['labels']:,}", *(f"{score:.3f}" for score in scores)]
+
+
+RUNGS = {
+    "r0": "reconstruction alone", "r1": "+ LOOCC as in the paper", "r2": "+ template start",
+    "r3": "+ cycle term", "r4": "+ stronger LOOCC", "r5": "+ whitening", "r6": "+ distillation",
+    "r7": "+ 60 steps per image",
+}  # fmt: skip
+
+
+def ladder(result: Any) -> Iterator[list[str]]:
+    """Means and deviations over the seeds that did not collapse, of each addition."""
+    keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3, "Yale B <= 50": 3}
+    yield ["each row adds to the one above", "whole runs", *RUNG_TITLES]
+    for rung, name in RUNGS.items():
+        seeds = [row for row in result["rows"] if row["rung"] == rung]
+        whole = [row for row in seeds if not row["collapsed"]]
+        if seeds:
+            cells = (_spread([row[key] for row in whole], digits) for key, digits in keys.items())
+            yield [name, f"{len(whole)} of {len(seeds)}", *cells]
+
+
+def paper_preset(result: Any) -> Iterator[list[str]]:
+    yield ["LOOCC", "images", "ended with", "L1", "LFW, NMI", "pairs of LFW"]
+    for row in result["rows"]:
+        scores = (
+            f"{row['l1 of held-out images']:.3f}",
+            f"{row['LFW']['nmi']:.3f}",
+            f"{row['pairs']['accuracy']:.3f}",
+        )
+        yield [row["loocc"], f"{row['images']:,}", row["ended"], *scores]
+
+
+RUNG_TITLES = ("SIDE x 100", "tracks, NMI", "LFW, NMI", "Yale B to 50°")
+
+
 def true_factors(result: Any) -> Iterator[list[str]]:
     model, untrained = (result["rows"][name][0]["truth"] for name in ("model", "untrained encoder"))
     yield ["true factor", *model["features"], "untrained, all"]
@@ -278,6 +345,9 @@ FACTORS = {
     "lighting, degrees": ("light", 1, 1),
     "viewpoint, degrees": ("camera", 1, 1),
 }
+LARGE = {"CelebA, 40 attributes": "celeba", "UTKFace, 5 races": "races"}
+IMAGES = {"L1": ("l1", 1, 4), "PSNR, dB": ("psnr_db", 1, 2), "SSIM": ("ssim", 1, 3)}
+GEOMETRY, TRUE, FITTED = ("intervals", "geometry"), ("intervals", "factors"), "generated/heads-fitted.json"
 BRIGHTNESS = {"correlation": ("r", 1, 3), "slope": ("slope", 1, 3), "error": ("error", 1, 4)}
 LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
 HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
@@ -302,8 +372,21 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "gpu-agreement": ("gpu.json", speed.gpu_agreement),
     "fitting": ("fitting.json", speed.fitting),
-    "heads-generated": ("generated/heads.json", scored(DEPTH, "intervals", "geometry")),
-    "factors-generated": ("generated/heads.json", scored(FACTORS, "intervals", "factors")),
+    "heads-generated": ("generated/heads.json", with_steps(scored(DEPTH, *GEOMETRY), FITTED)),
+    "factors-generated": ("generated/heads.json", with_steps(scored(FACTORS, *TRUE), FITTED)),
+    "people-lfw": ("published/lfw.json", scored(CLUSTERS, "rows")),
+    "people-lfw-fitted": ("published/lfw-fitted.json", scored(CLUSTERS, "rows")),
+    "people-lfw-finch": ("published/lfw-finch.json", scored(CLUSTERS, "rows")),
+    "disentanglement-lfw": ("published/disentanglement-lfw.json", disentangled),
+    "reconstruction-utkface": ("published/reconstruction-utkface.json", scored(IMAGES, "intervals")),
+    "reconstruction-lfw": (
+        "published/reconstruction-lfw.json",
+        with_steps(scored(IMAGES, "intervals"), "published/reconstruction-lfw-fitted.json"),
+    ),
+    "large-classes": ("published/celeba.json", side_by_side(LARGE, "accuracy")),
+    "celeba-labels": ("published/celeba-labels.json", probed),
+    "ladder": ("ladder.json", ladder),
+    "paper-gpu": ("paper-gpu.json", paper_preset),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
     "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
     "verification": ("verification.json", scored(PAIRS, "rows")),
@@ -321,7 +404,6 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "view": ("view.json", page_speed),
     "align": ("align.json", aligned),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
-    "brightness-rendered": ("brightness-rendered.json", scored(BRIGHTNESS, "brightness")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
     "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),
     "cars-depth-generated": ("generated/cars-geometry.json", scored(DEPTH, "intervals", "geometry")),

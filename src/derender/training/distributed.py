@@ -122,6 +122,7 @@ def open_fabric(accelerator: str) -> Any:
 
     if stands_in:
         del sys.modules["torchmetrics"]
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its hints are not on this program
     world = started_together()
     if world == 1:
         return Fabric(accelerator=accelerator, devices=1)
@@ -129,7 +130,6 @@ def open_fabric(accelerator: str) -> Any:
     buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
     options: dict[str, Any] = {"find_unused_parameters": True, buffers: False}
     local = int(os.environ["LOCAL_WORLD_SIZE"])
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # quiet while processes find each other
     fabric = Fabric(
         accelerator=accelerator, devices=local, num_nodes=world // local, strategy=DDPStrategy(**options)
     )
