@@ -95,7 +95,7 @@ def test_features_do_not_depend_on_neighbours_or_threads():
     model = model.with_features(model.features.with_steps(20))
     threads, encoded = torch.get_num_threads(), {"geometry": 192, "albedo": 192}
     with torch.inference_mode():
-        together, alone = model.embed(images), [model.embed(one[None]) for one in images]
+        together, alone = model.embed(images), [model.embed(one[None]) for one in images[:8]]
         try:
             torch.set_num_threads(3 - min(threads, 2))
             otherwise = model.embed(images)
@@ -103,7 +103,7 @@ def test_features_do_not_depend_on_neighbours_or_threads():
             torch.set_num_threads(threads)
     for name, one in together.items():
         for other in (torch.cat([each[name] for each in alone]), otherwise[name]):
-            apart = (one - other).abs().amax(dim=0) / one.abs().max()
+            apart = (one[: len(other)] - other).abs().amax(dim=0) / one.abs().max()
             by_encoder, by_fit = apart[: encoded.get(name)], apart[encoded.get(name, len(apart)) :]
             largest = float(by_encoder.max()), max(by_fit.tolist(), default=0.0)
             sys.stdout.write(f"{name}: {largest[0]:.1e} of encoders, {largest[1]:.1e} of fitted scenes\n")

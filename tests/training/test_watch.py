@@ -119,7 +119,7 @@ def test_a_memory_that_no_watcher_gave_is_refused(memory):
 COLLAPSING = ["image_size=32", "width=8", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]
 COLLAPSING += ["curvature_weight=0", "learning_rate=1e-2", "weight_decay=0", "warmup_images=0"]
 COLLAPSING += ["final_rate=1", "whitening.pictures=0", "fitting.examples=0"]
-SOONER = 5
+SOONER = 8
 """By how much the clock of the watcher is faster in a real collapse."""
 
 

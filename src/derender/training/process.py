@@ -106,15 +106,17 @@ def locked(run: Path) -> Iterator[None]:
         yield
         return
     made, file = not run.exists(), run.absolute() / LOCK_FILE
-    run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(file, timeout=0, is_singleton=True)
     try:
+        run.mkdir(parents=True, exist_ok=True)
         lock.acquire()
-    except Timeout as error:
+    except (Timeout, FileNotFoundError, FileExistsError) as error:  # the last two: it has just gone again
+        if run.is_file():
+            raise
         raise ValueError(f"{run} is being written by another process: wait for it, or end it") from error
     try:
         yield
     finally:
-        lock.release()
         if made and [entry.name for entry in run.iterdir()] in ([], [LOCK_FILE]):
-            shutil.rmtree(run, ignore_errors=True)
+            shutil.rmtree(run, ignore_errors=True)  # before another can hold its lock
+        lock.release()
