@@ -33,7 +33,7 @@ release: $(STAMP)  ## licences and known advisories of every package, into build
 # stopped run goes on where it was. `make results RESULTS=folder` leaves the files of the repository alone.
 RESULTS := benchmarks/results/generated
 DATA := build/results
-SCORES := heads heads-fitted brightness people cars-clusters cars-geometry
+SCORES := heads heads-fitted brightness people cars-clusters cars-geometry robustness-faces robustness-cars
 results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
 	@$(BIN)/python docs/pages.py
 
@@ -59,6 +59,10 @@ $(RESULTS)/cars-clusters.json: | $(DATA)/cars
 	$(SCORE) $(CARS-CLUSTERS)
 $(RESULTS)/cars-geometry.json: | $(DATA)/cars
 	$(SCORE) $(CARS-GEOMETRY)
+$(RESULTS)/robustness-faces.json: | $(STAMP)
+	$(SCORE) evaluate robustness --model rendered-faces-64 --pictures faces
+$(RESULTS)/robustness-cars.json: | $(STAMP)
+	$(SCORE) evaluate robustness --model cars-64 --pictures cars
 
 # Results on sets that come from their owners: lfw64.zip, utkface64.zip and celeba64.zip in IMAGES, aligned, 64 pixels.
 PUBLISHED := benchmarks/results/published
@@ -75,6 +79,10 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make publishe
 	  "reconstruction-lfw-fitted evaluate reconstruction $(IMAGES)/lfw64.zip --model faces-64 --limit 800 --fit-steps 60" \
 	  "races evaluate cluster $(IMAGES)/utkface64.zip --model faces-64 --limit 4000 --label race --resamples 200" \
 	  "celeba-labels evaluate linear $(IMAGES)/celeba64.zip --model faces-64 --attributes --heads linear,centred,logistic --resamples 200 --seeds 1" \
+	  "robustness-lfw evaluate robustness $(IMAGES)/lfw64.zip --model faces-64 --pictures render $(LFW)" \
+	  "compare-identity compare --table identity --model faces-64 $(IMAGES)/lfw64.zip" \
+	  "compare-emotion compare --table emotion --model faces-64 $(IMAGES)/lfw64.zip" \
+	  "compare-clustering compare --table clustering --model faces-64 $(IMAGES)/celeba64.zip" \
 	  "celeba evaluate cluster $(IMAGES)/celeba64.zip --model faces-64 --attributes --resamples 200"; do \
 	  set -- $$step; name=$$1; shift; $(BIN)/python benchmarks/score.py $(PUBLISHED)/$$name.json "$$@" || exit 1; \
 	done; $(BIN)/python docs/pages.py

@@ -20,11 +20,11 @@ RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 def table(name: str, keys: list[str] | None = None) -> str:
     """One table as Markdown, with a note: its file, and data that are not generated."""
     if name in FILES:
-        file, read = FILES[name]
-        result = json.loads((RESULTS / file).read_text())
-        head, *rows = read(result)
+        files, read = FILES[name]
+        first, *_ = names = files.split()
+        head, *rows = read(json.loads((RESULTS / first).read_text()))
         lines = [head, ["---"] * len(head), *rows]
-        note = f"`benchmarks/results/{file}`"
+        note = ", ".join(f"`benchmarks/results/{one}`" for one in names)
     else:
         result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
         lines = [*body(result, keys or [column["key"] for column in result["columns"]])]
@@ -55,7 +55,7 @@ def looked_up(reference: re.Match[str]) -> str:
     """``{table|row|column}`` in a cell: that number, as its own table shows it, without its interval."""
     name, row, key = reference[1].split("|")
     if name in FILES:
-        head, *rows = FILES[name][1](json.loads((RESULTS / FILES[name][0]).read_text()))
+        head, *rows = FILES[name][1](kept(FILES[name][0].split()[0]))
         return next(cells for cells in rows if cells[0] == row)[head.index(key)].split(" (")[0]
     result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
     digits = next(column["digits"] for column in result["columns"] if column["key"] == key)
@@ -215,7 +215,7 @@ def with_steps(read: Callable[[Any], Iterator[list[str]]], file: str) -> Callabl
 
     def both(result: Any) -> Iterator[list[str]]:
         head, *rows = read(result)
-        _, first, *_ = read(json.loads((RESULTS / file).read_text()))
+        _, first, *_ = read(kept(file))
         yield from (head, [f"{first[0]}, 60 steps per image", *first[1:]], *rows)
 
     return both
@@ -226,13 +226,52 @@ def side_by_side(heads: Mapping[str, str], key: str) -> Callable[[Any], Iterator
 
     def read(_: Any) -> Iterator[list[str]]:
         yield ["", *heads]
-        files = [json.loads((RESULTS / "published" / f"{name}.json").read_text()) for name in heads.values()]
+        files = [kept(f"published/{name}.json") for name in heads.values()]
         for name, row in files[0]["rows"].items():
             note = " (control)" if row["control"] else ""
             shown = (file["rows"][name]["scores"][key]["value"] for file in files)
             yield [name + note, *(f"{value:.3f}" for value in shown)]
 
     return read
+
+
+def kept(name: str) -> Any:
+    """A file of benchmarks/results."""
+    return json.loads((RESULTS / name).read_text())
+
+
+def turned_and_lit(_: Any) -> Iterator[list[str]]:
+    """Accuracy over growing angles: its mean, and at the largest."""
+    yield ["", *(f"{what}: {where}" for what in ("yaw", "light") for where in ("area", "at the end"))]
+    for what, file in ROBUST.items():
+        curves = kept(file)["curves"]
+        for name in ("geometry + albedo", "untrained encoder", "pixels"):
+            cells = []
+            for curve in (curves["yaw"], curves["light"]):
+                scores = curve["accuracy"][name]["scores"]
+                last = f"{curve['levels_deg'][-1]:g} deg"
+                cells += [f"{scores[key]['value']:.3f}" for key in ("area", last)]
+            note = "" if name == "geometry + albedo" else " (control)"
+            yield [f"{what}: {name}{note}", *cells]
+
+
+def beside_the_paper(_: Any) -> Iterator[list[str]]:
+    """Accuracy of Ward clusters beside the paper's rows; other data, so other numbers of the controls."""
+    parts = [kept(f"published/compare-{file}.json")["parts"][part] for file, part in PAPER.items()]
+    yield ["", "CelebA", "emotion", "identity"]
+    for name, row in parts[0]["rows"].items():
+        note = " (control)" if row["control"] else ""
+        yield [name + note, *(f"{part['rows'][name]['scores']['accuracy']['value']:.3f}" for part in parts)]
+    theirs = [{row["method"]: row["scores"]["accuracy"] for row in reversed(part["paper"])} for part in parts]
+    for method in [row["method"] for row in parts[0]["paper"]]:
+        yield [f"the paper: {method}", *(f"{part[method]:.3f}" for part in theirs)]
+
+
+ROBUST = {
+    "people": "generated/robustness-faces.json", "LFW": "published/robustness-lfw.json",
+    "cars": "generated/robustness-cars.json",
+}  # fmt: skip
+PAPER = {"clustering": "attributes", "emotion": "emotion", "identity": "identity"}
 
 
 def probed(result: Any) -> Iterator[list[str]]:
@@ -354,6 +393,7 @@ HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
     "view 15": "view 15°",
     "view 30": "view 30°",
 }
+# by table: its files, of which the first is read for it, and its reader
 FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "edits-yale": ("photo_edits.json", edits("yale", LIGHTS)),
     "edits-heads": ("photo_edits.json", edits("generated heads", HEADS)),
@@ -372,19 +412,21 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "gpu-agreement": ("gpu.json", speed.gpu_agreement),
     "fitting": ("fitting.json", speed.fitting),
-    "heads-generated": ("generated/heads.json", with_steps(scored(DEPTH, *GEOMETRY), FITTED)),
-    "factors-generated": ("generated/heads.json", with_steps(scored(FACTORS, *TRUE), FITTED)),
+    "heads-generated": (f"generated/heads.json {FITTED}", with_steps(scored(DEPTH, *GEOMETRY), FITTED)),
+    "factors-generated": (f"generated/heads.json {FITTED}", with_steps(scored(FACTORS, *TRUE), FITTED)),
     "people-lfw": ("published/lfw.json", scored(CLUSTERS, "rows")),
     "people-lfw-fitted": ("published/lfw-fitted.json", scored(CLUSTERS, "rows")),
     "people-lfw-finch": ("published/lfw-finch.json", scored(CLUSTERS, "rows")),
     "disentanglement-lfw": ("published/disentanglement-lfw.json", disentangled),
     "reconstruction-utkface": ("published/reconstruction-utkface.json", scored(IMAGES, "intervals")),
     "reconstruction-lfw": (
-        "published/reconstruction-lfw.json",
+        "published/reconstruction-lfw.json published/reconstruction-lfw-fitted.json",
         with_steps(scored(IMAGES, "intervals"), "published/reconstruction-lfw-fitted.json"),
     ),
-    "large-classes": ("published/celeba.json", side_by_side(LARGE, "accuracy")),
+    "large-classes": ("published/celeba.json published/races.json", side_by_side(LARGE, "accuracy")),
     "celeba-labels": ("published/celeba-labels.json", probed),
+    "robustness-generated": (" ".join(ROBUST.values()), turned_and_lit),
+    "paper-clustering": (" ".join(f"published/compare-{one}.json" for one in PAPER), beside_the_paper),
     "ladder": ("ladder.json", ladder),
     "paper-gpu": ("paper-gpu.json", paper_preset),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
