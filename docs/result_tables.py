@@ -298,7 +298,8 @@ def ladder(result: Any) -> Iterator[list[str]]:
         seeds = [row for row in result["rows"] if row["rung"] == rung]
         whole = [row for row in seeds if not row["collapsed"]]
         if seeds:
-            cells = (_spread([row[key] for row in whole], digits) for key, digits in keys.items())
+            values = {key: [row[key] for row in whole if key in row] for key in keys}
+            cells = (_spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
             yield [name, f"{len(whole)} of {len(seeds)}", *cells]
 
 
