@@ -9,10 +9,11 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any
 
+import renderer_tables as drawn
 import speed_tables as speed
+from renderer_tables import spread
 
 RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 
@@ -129,75 +130,6 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
     return read
 
 
-def renderers(result: Any) -> Iterator[list[str]]:
-    """Reconstruction error of scenes optimised with each renderer, by effect, mean over seeds."""
-    cells = result["cells"]
-    names = list(dict.fromkeys(one["renderer"] for one in cells))
-    yield ["effect in the images; L1 with", *names]
-    for effect in dict.fromkeys(one["effect"] for one in cells):
-        means = []
-        for name in names:
-            errors = [one["l1"] for one in cells if (one["effect"], one["renderer"]) == (effect, name)]
-            means.append(f"{sum(errors) / len(errors):.4f}" if errors else "")
-        yield [effect, *means]
-
-
-def renderer_speed(result: Any) -> Iterator[list[str]]:
-    yield ["renderer", "forward, ms", "with gradients, ms", "with gradients / lambert"]
-    for one in result["cells"]:
-        cells = (("forward_ms", 1), ("forward_and_backward_ms", 1), ("forward_and_backward_over_lambert", 2))
-        yield [one["renderer"], *(f"{one[key]:.{digits}f}" for key, digits in cells)]
-
-
-def renderers_trained(result: Any, clear: bool = False) -> Iterator[list[str]]:
-    """Errors of models trained with each renderer, by effect or of ``clear`` images: mean, deviation."""
-    digits = {"normal_deg": 1, "albedo": 3, "albedo_chroma": 4, "l1": 4}
-    titles = ("normals, degrees", "albedo error", "chroma error", "L1", "albedo / lambert", "seeds")
-    yield ["effect in the images: renderer", *titles]
-    groups = _trained(result)
-    for effect, name in [pair for pair in groups if (pair[0] == "none") == clear]:
-        ones = groups[effect, name]
-        means = [_spread([one[key] for one in ones], n) for key, n in digits.items()]
-        plain = {one["seed"]: one["albedo"] for one in groups[effect, "lambert"]}
-        ratio = _spread([one["albedo"] / plain[one["seed"]] for one in ones], 2)
-        yield [f"{effect}: {name}", *means, ratio, ", ".join(str(one["seed"]) for one in ones)]
-
-
-def effect_numbers(result: Any) -> Iterator[list[str]]:
-    """Rank correlation and median errors of an effect's own numbers in trained models."""
-    yield ["number, renderer", "rank correlation", "median error", "after the best line", "of a constant"]
-    ends = ("spearman", "median_error", "median_error_of_line", "median_error_of_constant")
-    for (_, name), ones in _trained(result).items():
-        for number in [key.removesuffix("_spearman") for key in ones[0] if key.endswith("_spearman")]:
-            means = (_spread([one[f"{number}_{end}"] for one in ones], 2) for end in ends)
-            yield [f"{number.replace('_', ' ')}: {name}", *means]
-
-
-def _trained(result: Any) -> dict[tuple[str, str], list[Any]]:
-    """Cells of every seed by effect and renderer, in the order of a table."""
-    groups: dict[tuple[str, str], list[Any]] = {}
-    order = ["none", "shadows", "gloss", "lamps", "haze"]
-    for one in sorted(result["cells"], key=lambda one: (order.index(one["effect"]), one["seed"])):
-        groups.setdefault((one["effect"], one["renderer"]), []).append(one)
-    return groups
-
-
-def _spread(values: list[float], digits: int) -> str:
-    text = f"{fmean(values):.{digits}f}"
-    return text if len(values) < 2 else f"{text} ± {stdev(values):.{digits}f}"
-
-
-def renderers_yale(result: Any) -> Iterator[list[str]]:
-    """Residuals by the light's angle, and its azimuth and elevation, of scenes fitted to Extended Yale B."""
-    residuals = {"L1 to 25°": "0_25", "25° to 50°": "25_50", "50° to 77°": "50_78"}
-    yield ["renderer", *residuals, *(f"{what}: r, error" for what in ("azimuth", "elevation"))]
-    for one in result["cells"]:
-        shown = [f"{one[f'residual_{span}']:.4f}" for span in residuals.values()]
-        for what in ("azimuth", "elevation"):
-            shown.append(f"{one[f'{what}_correlation']:.3f}, {one[f'{what}_mean_error_deg']:.1f}°")
-        yield [one["renderer"], *shown]
-
-
 def million_rows(result: Any) -> Iterator[list[str]]:
     yield ["1,000,000 rows of 128, one thread", "seconds"]
     names = {
@@ -299,8 +231,17 @@ def ladder(result: Any) -> Iterator[list[str]]:
         whole = [row for row in seeds if not row["collapsed"]]
         if seeds:
             values = {key: [row[key] for row in whole if key in row] for key in keys}
-            cells = (_spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
+            cells = (spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
             yield [name, f"{len(whole)} of {len(seeds)}", *cells]
+    controls = {file: kept(file)["rows"] for file in LADDER_CONTROLS}
+    depth = kept("generated/heads.json")["intervals"]["geometry"]
+    side = {name: f"{100 * depth[row]['scores']['side']['value']:.2f}" for name, row in LADDER_DEPTH.items()}
+    yield ["average depth (control)", "", side["average depth"], "", "", ""]
+    for name in ("untrained encoder", "PCA (64)", "pixels"):
+        scores = (
+            f"{controls[file][name]['scores'][key]['value']:.3f}" for file, key in LADDER_CONTROLS.items()
+        )
+        yield [f"{name} (control)", "", side.get(name, ""), *scores]
 
 
 def paper_preset(result: Any) -> Iterator[list[str]]:
@@ -314,6 +255,8 @@ def paper_preset(result: Any) -> Iterator[list[str]]:
         yield [row["loocc"], f"{row['images']:,}", row["ended"], *scores]
 
 
+LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi", "identity_all.json": "<= 50"}
+LADDER_DEPTH = {"average depth": "average depth", "untrained encoder": "untrained model"}
 RUNG_TITLES = ("SIDE x 100", "tracks, NMI", "LFW, NMI", "Yale B to 50°")
 
 
@@ -428,7 +371,7 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "celeba-labels": ("published/celeba-labels.json", probed),
     "robustness-generated": (" ".join(ROBUST.values()), turned_and_lit),
     "paper-clustering": (" ".join(f"published/compare-{one}.json" for one in PAPER), beside_the_paper),
-    "ladder": ("ladder.json", ladder),
+    "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
     "paper-gpu": ("paper-gpu.json", paper_preset),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
     "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
@@ -437,12 +380,12 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "light": ("light.json", angles),
     "light-optimised": ("light-optimised.json", angles),
     "relighting": ("relighting.json", scored(PSNR, "psnr")),
-    "renderers": ("renderers_fit.json", renderers),
-    "renderers-speed": ("renderers_speed.json", renderer_speed),
-    "renderers-train": ("renderers_train.json", renderers_trained),
-    "renderers-clear": ("renderers_train.json", lambda result: renderers_trained(result, clear=True)),
-    "renderers-numbers": ("renderers_train.json", effect_numbers),
-    "renderers-yale": ("renderers_yaleb.json", renderers_yale),
+    "renderers": ("renderers_fit.json", drawn.renderers),
+    "renderers-speed": ("renderers_speed.json", drawn.renderer_speed),
+    "renderers-train": ("renderers_train.json", drawn.renderers_trained),
+    "renderers-clear": ("renderers_train.json", lambda result: drawn.renderers_trained(result, clear=True)),
+    "renderers-numbers": ("renderers_train.json", drawn.effect_numbers),
+    "renderers-yale": ("renderers_yaleb.json", drawn.renderers_yale),
     "table-million": ("table_million.json", million_rows),
     "view": ("view.json", page_speed),
     "align": ("align.json", aligned),
