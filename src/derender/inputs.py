@@ -50,8 +50,8 @@ def as_model(
 
 def as_images(
     images: ImageSet | str | Path, image_size: int, *, dataset: str = "auto", limit: int | None = None,
-    part: str = "all", model: str | Path | None = None, at_least: int = 1, keep_duplicates: bool = False,
-    progress: Progress | None = None,
+    part: str = "all", model: str | Path | SplitRecord | None = None, at_least: int = 1,
+    keep_duplicates: bool = False, progress: Progress | None = None,
 ) -> ImageSet:  # fmt: skip
     """Decoded images: a set that is read already is returned as it is, an address is read.
 
@@ -60,7 +60,7 @@ def as_images(
         image_size: side in pixels to read at.
         dataset, limit: the layout's name, or "auto"; at most so many images, evenly spaced in the sorted
         list.
-        part, model: "all", or the "train", "validation" or "test" part of the split that a model records.
+        part, model: "all", or the "train", "validation" or "test" part of a split, or of a model's.
         at_least, keep_duplicates: fewer images raise an error; keep every one of identical images.
         progress: called with (done, total) while reading.
     """
@@ -72,14 +72,14 @@ def as_images(
     return part_of(images, part, model).require(at_least)
 
 
-def part_of(images: ImageSet, part: str, model: str | Path | None) -> ImageSet:
-    """The images of one part of the split of ``model``: a run, or a model that was saved from one."""
+def part_of(images: ImageSet, part: str, model: str | Path | SplitRecord | None) -> ImageSet:
+    """The images of one part of a split, or of that of a run or of a model that was saved from one."""
     require_known("part", part, PARTS)
     if part == "all":
         return images
     if model is None:
         raise ValueError(f"part {part!r} needs a model: the run whose split it is")
-    record = split_of(model)
+    record = model if isinstance(model, SplitRecord) else split_of(model)
     if record is None:
         raise ValueError(f"{model} is no run folder and records no split: use part all")
     split = split_indices(images.files, record.shares, seed=record.seed)

@@ -25,16 +25,13 @@ class Planned:
 def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
     """Do a plan, or continue it, and show the summary of each protocol."""
     from derender import learn
-    from derender.learn.plan import read_plan
-    from derender.learn.sweep import Comparison, jobs_of
+    from derender.learn.sweep import read_plan, states_of
 
     plan, out = read_plan(str(planned.plan)), planned.out
     if planned.dry_run:
-        notes = {job.name: out and Comparison(plan, out).note(job) for job in jobs_of(plan)}
-        states = {}
-        for name, note in notes.items():
-            states[name] = "to do" if not note else "failed" if note.why else "done"
-            result(f"{name}: {states[name]}", json_file)
+        states = states_of(plan, out)
+        for job, state in states.items():
+            result(f"{job}: {state}", json_file)
         write_json(json_file, {"jobs": states, "plan": plan.model_dump(mode="json")})
         return
     if out is None:

@@ -9,18 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, StringConstraints
 
 from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
-from derender.data import suggestion
-from derender.evaluation.paper_tables import TABLES
 from derender.features import named
 from derender.settings import Settings
 from derender.storage.bounded import YAML_LIMIT, parse_yaml, read_text
 from derender.training.config import as_overrides, config_from_tree, resolve
 
 OURS = "derender"
-KINDS = (OURS, *BASELINES)
+KINDS = {kind: kind for kind in (OURS, *BASELINES)} | {"ours": OURS}
 ALWAYS_THERE = ("pixels", "pca", "untrained")  # every table has these controls
 WITHOUT_LOOP = ("resnet18", "ris")  # trained, but not by the training loop: no number of images seen
 
@@ -34,6 +32,7 @@ def _methods(given: Any) -> Any:
 
 ONE_OR_MANY = BeforeValidator(lambda one: (one,) if isinstance(one, str) else one)
 Names = Annotated[tuple[str, ...], ONE_OR_MANY]
+Name = Annotated[str, StringConstraints(pattern=r'^[^/\\:*?"<>|.][^/\\:*?"<>|]*$')]  # a folder's, too
 
 
 class ImageSource(Settings):
@@ -70,7 +69,7 @@ class ScoredSet(ImageSource):
     trained_on: str | None = None  # training set of the methods that are scored here
     part: Literal["all", "train", "validation", "test"] = "all"  # of that training set's split
     protocols: Annotated[tuple[Literal["cluster", "linear"], ...], ONE_OR_MANY] = ("cluster",)
-    table: str | None = None  # one of the paper's: identity, emotion, clustering, linear, cars
+    table: Literal["clustering", "identity", "emotion", "linear", "cars"] | None = None  # of the paper
     label: Names = ()
     mean_by: Names = ()
     min_count: int = Field(default=1, ge=1)
@@ -84,9 +83,9 @@ class Plan(Settings):
     settings: dict[str, Any] = Field(default_factory=dict)  # of every training in the loop, as --set
     seeds: int = Field(default=1, ge=1)  # trainings of each method, on each training set
     image_size: int = Field(default=64, ge=8)  # of methods without a network of a fixed size
-    train: dict[str, TrainingSet] = Field(default_factory=dict)
-    methods: Annotated[dict[str, Method], BeforeValidator(_methods)] = Field(default_factory=dict)
-    score: dict[str, ScoredSet] = Field(default_factory=dict)
+    train: dict[Name, TrainingSet] = Field(default_factory=dict)
+    methods: Annotated[dict[Name, Method], BeforeValidator(_methods)] = Field(default_factory=dict)
+    score: dict[Name, ScoredSet] = Field(default_factory=dict)
     clustering: Literal["ward", "finch", "k-means"] = "ward"
     counts: tuple[int, ...] = (100, 500, 1_000)  # labelled rows of the linear protocol
     draws: int = Field(default=5, ge=1)  # random subsets of these rows
@@ -98,9 +97,9 @@ class Plan(Settings):
         return self.methods[name].like or name
 
     def kind(self, name: str) -> str:
-        """``derender`` or a baseline's name."""
-        kind = self.methods[self.source(name)].kind or self.source(name)
-        return OURS if kind == "ours" else kind
+        """``derender`` or a baseline's name; another is a ValueError."""
+        source = self.source(name)
+        return named(KINDS, named(self.methods, source, "like").kind or source, "kind of method")
 
     def is_trained(self, name: str) -> bool:
         """Whether it has a run for each training set."""
@@ -111,9 +110,11 @@ class Plan(Settings):
         return [name for name in self.methods if self.kind(name) not in ALWAYS_THERE]
 
     def configuration(self, name: str, trained_on: str, seed: int) -> Any:
-        """The settings of one training."""
+        """The settings of one training; one that does not fit is a ValueError."""
         kind, method = self.kind(name), self.methods[name]
         tree = {**method.settings, **method.settings_on.get(trained_on, {})}
+        if own := {"images", "split", "seed"} & {*self.settings, *tree}:
+            raise ValueError(f"{min(own)} is the plan's own, the same for all: not in settings of {name!r}")
         if kind not in WITHOUT_LOOP:
             tree = {**self.settings, **tree, "images": self.images}
         changes = as_overrides({**tree, "split": self.train[trained_on].split, "seed": seed})
@@ -136,8 +137,6 @@ def read_plan(path: str | Path) -> Plan:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as a plan: {error}") from error
     try:
-        if not isinstance(tree, dict):
-            raise ValueError("it should have methods: and score:")
         plan = config_from_tree(tree, Plan)
         for fault in _faults(plan):
             raise ValueError(fault)
@@ -147,57 +146,35 @@ def read_plan(path: str | Path) -> Plan:
 
 
 def _faults(plan: Plan) -> Iterator[str]:
-    """What in a plan does not fit the rest of it."""
+    """What in a plan does not fit the rest of it; unknown names raise."""
     if not (plan.methods and plan.score):
         yield "a plan needs at least one of methods: and one of score:"
-    for name in (*plan.train, *plan.methods, *plan.score):
-        if not name or set(name) & set('/\\:*?"<>|') or name.startswith("."):
-            yield f"the name {name!r} cannot be a folder's: leave out / \\ : * ? and the like"
     for name, method in plan.methods.items():
-        own = bool(method.settings or method.settings_on or method.runs)
-        if (like := method.like) is not None:
-            if named(plan.methods, like, "like").like is not None:
-                yield f"method {name!r} is like {like!r}, which is like another: name that one"
-            if own or method.kind or method.model:
-                yield f"method {name!r} is like {like!r}: it takes features and whitened alone"
-        if (kind := plan.kind(name)) not in KINDS:
-            yield f"method {name!r} is of no known kind{suggestion(kind, KINDS)}: choose {', '.join(KINDS)}"
+        kind, learns = plan.kind(name), {"settings", "settings_on", "runs"}
+        if plan.methods[plan.source(name)].like is not None:
+            yield f"method {name!r} is like {method.like!r}, which is like another: name that one"
+        why, barred = f"({kind}) is not trained here", {*learns, "model"} if kind in CONTROLS else learns
+        if method.like is not None:
+            why, barred = f"is like {method.like!r}", {*learns, "model", "kind"}
+        elif plan.is_trained(name):
+            barred = set()
+        if extra := sorted(barred & method.model_fields_set):
+            yield f"method {name!r} {why}: leave out {', '.join(extra)}"
         for where in (*method.runs, *method.settings_on):
             named(plan.train, where, "training set")
-        given = [plan.settings, method.settings, *method.settings_on.values()]
-        for key in ("images", "split", "seed"):
-            if any(key in one for one in given):
-                yield f"{key} is the plan's own and the same for all: not in settings of {name!r}"
-        if own and kind not in (OURS, *TRAINED):
-            yield f"method {name!r} ({kind}) is not trained here: leave settings and runs out"
-        if method.model is not None and (kind in CONTROLS or method.runs):
-            yield f"method {name!r}: model is one trained network; leave it or runs out"
-    for name, scored in plan.score.items():
-        yield from _score_faults(plan, f"score {name!r}", scored)
-
-
-def _score_faults(plan: Plan, name: str, scored: ScoredSet) -> Iterator[str]:
-    if (scored.table is None) == (not scored.label):
-        yield f"{name} needs a table (identity, emotion, ...) or a label, not both"
-    if scored.table is not None:
-        if named(TABLES, scored.table, "table").kind == "segment":
-            yield f"{name}: segmentation trains nets of its own: use derender compare --table segmentation"
-        if scored.mean_by or scored.min_count > 1 or scored.max_count is not None:
-            yield f"{name}: mean_by, min_count and max_count go with label, not with table"
     trained = [method for method in plan.rows() if plan.is_trained(method)]
-    if scored.trained_on is None:
-        if trained:
-            yield f"{name} needs trained_on: {trained[0]!r} has to learn from something"
-        if scored.part != "all":
-            yield f"{name}: part {scored.part} is of a training set: give trained_on"
-        return
-    learnt = named(plan.train, scored.trained_on, "training set")
-    if scored.part != "all":
-        if (scored.data, scored.dataset, scored.limit) != (learnt.data, learnt.dataset, learnt.limit):
-            other = f"the images of {scored.trained_on!r}: give the same data, dataset and limit"
-            yield f"{name}: part {scored.part} is of {learnt.data}, {other}"
-        if plan.seeds > 1:
-            yield f"{name}: every seed splits anew, so part goes with seeds: 1"
-    for method in trained:
-        if plan.methods[method].like is None and scored.trained_on not in plan.methods[method].runs:
-            plan.configuration(method, scored.trained_on, 0)  # raises where a setting does not fit
+    for name, scored in plan.score.items():
+        where, part, needs = scored.trained_on, scored.part != "all", f"score {name!r} needs"
+        if (scored.table is None) == (not scored.label):
+            yield f"{needs} a table (identity, emotion, ...) or a label, not both"
+        if where is None:
+            if trained or part:
+                yield f"{needs} trained_on: the training set of {', '.join(trained) or 'its part'}"
+            continue
+        learnt = named(plan.train, where, "training set")
+        same = all(getattr(scored, key) == getattr(learnt, key) for key in ImageSource.model_fields)
+        if part and (not same or plan.seeds > 1):
+            yield f"{needs} seeds: 1 and the data, dataset and limit of {where!r} for its part"
+        for method in trained:
+            if plan.methods[method].like is None and where not in plan.methods[method].runs:
+                plan.configuration(method, where, 0)  # raises where a setting does not fit

@@ -1,4 +1,4 @@
-"""A plan from file to tables: what it leaves, and kill -9 in the middle."""
+"""A plan from file to tables: what it leaves, kill -9 in the middle, jobs that fail."""
 
 import json
 import signal
@@ -23,7 +23,9 @@ methods:
   hog:
   gone: {kind: ae, runs: {colours: PEOPLE/none}}
 score:
-  people: {data: PEOPLE, trained_on: colours, label: class}
+  people: {data: PEOPLE, trained_on: colours, label: class, protocols: [cluster, linear]}
+counts: [8]
+draws: 1
 untrained_seeds: 1
 resamples: 10
 """
@@ -63,30 +65,57 @@ def whole(plan) -> Path:
 def scores(out: Path) -> dict:
     """Every score of the clustering table."""
     told = json.loads((out / "comparison.json").read_text())
-    return {one["name"]: one["rows"] for one in told["questions"]}
+    return {one["name"]: one["rows"] for one in told["questions"] if one["protocol"] == "cluster"}
 
 
 def test_one_table_with_controls_and_what_failed(whole):
     told = json.loads((whole / "comparison.json").read_text())
-    (question,) = told["questions"]
+    question = told["questions"][0]
     controls = ["untrained encoder", "PCA (10)", "pixels", "majority", "chance"]
     assert list(question["rows"]) == ["ae", "hog", *controls]
     assert question["rows"]["pixels"]["scores"]["accuracy"]["value"] == 1
-    assert question["absent"]["gone"].startswith("no baseline at") and "gone" in told["failed"][0]
+    (failed,) = told["failed"]
+    assert failed.startswith("embed gone of people: no baseline at")
     text = (whole / "comparison.md").read_text()
-    assert "| gone | failed | - |" in text and "Failed:" in text and "*majority*" in text
+    assert "| gone | failed | failed |" in text and failed in text and "*majority*" in text
+    assert "people: Ward" in text and "people: above the strongest control?" in text
     page = (whole / "comparison.html").read_text()
-    assert page.count("<svg") >= 2 and "One training seed each" in page
+    assert failed.partition("'")[0] in page and page.count("<svg") > 2 and "One training seed each" in page
+
+
+def test_few_labels_show_one_head_and_the_tables_of_all(whole):
+    summary, _, tables = (whole / "comparison.md").read_text().partition("people: 8 labelled rows")
+    assert "| features | people, 8 labels: balanced ↑ |" in summary and "| gone | failed |" in summary
+    assert "k-NN" not in summary and "k-NN" in tables and "penalised logistic regression" in tables
 
 
 def test_the_same_command_again_does_nothing_twice(plan, whole, capsys):
     before, weights = scores(whole), whole / "runs" / "colours" / "ae" / "model" / "model.safetensors"
     at = weights.stat().st_mtime_ns
-    assert main(["compare", "--plan", str(plan), "--out", str(whole)]) == 0
+    assert (
+        main(["compare", "--plan", str(plan), "--out", str(whole), "--workers", "2", "--minutes", "9"]) == 0
+    )
     printed = capsys.readouterr().err
-    assert "train gone on colours: failed" in printed  # tried again: it may have come
-    assert "train ae" not in printed and "embed ae" not in printed
+    assert "embed gone of people: failed" in printed  # tried again: it may have come
+    assert "train ae" not in printed and "score people" not in printed
     assert scores(whole) == before and weights.stat().st_mtime_ns == at
+
+
+def test_jobs_whose_inputs_changed_are_done_again(plan, whole, numbers, tmp_path):
+    changed = tmp_path / "changed.yaml"
+    for old, new, again in (
+        ("resamples: 10", "resamples: 11", ["score people"]),
+        ("code_size: 8", "code_size: 4", ["train ae on colours", "embed ae of people", "score people"]),
+        (
+            "untrained_seeds",
+            "seeds: 2\nuntrained_seeds",
+            ["train ae on colours, seed 1", "embed ae of people, seed 1"],
+        ),
+    ):
+        changed.write_text(plan.read_text().replace(old, new).replace("  gone: {kind: ae", "  # {"))
+        told, _ = numbers("compare", "--plan", changed, "--out", whole, "--dry-run")
+        todo = [job for job, state in told["jobs"].items() if state == "to do"]
+        assert set(again) <= set(todo) and ("embed hog of people" not in todo), (old, todo)
 
 
 def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole):
@@ -96,6 +125,7 @@ def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole):
     words = ["compare", "--plan", str(plan), "--out", str(out)]
     done = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, timeout=250)
     assert done.returncode == -signal.SIGKILL
+    assert (out / "runs" / "colours" / "ae" / "checkpoints" / "last").is_dir()
     assert not (out / "comparison.json").exists()
     assert main(words) == 0
     assert scores(out) == scores(whole)

@@ -3,7 +3,7 @@
 import pytest
 
 from derender.learn.plan import Plan, read_plan
-from derender.learn.sweep import jobs_of
+from derender.learn.sweep import states_of
 
 GOOD = """
 images: 1000
@@ -47,16 +47,21 @@ def test_every_training_gets_the_plans_pictures_split_and_seed(read):
 
 
 def test_jobs_share_trainings_and_come_after_what_they_need(read):
-    jobs = jobs_of(read())
-    names = [job.name for job in jobs]
-    assert len(set(names)) == len(names) == len({job.slug for job in jobs})
-    assert sum(job.kind == "train" for job in jobs) == 2 * 2 * 2  # methods, training sets, seeds
-    embeddings = [job for job in jobs if job.kind == "embed" and job.where == "lfw"]
-    wanted = [(name, seed) for name in ("ours", "codes", "small vqvae") for seed in (0, 1)]
-    assert [(job.method, job.seed) for job in embeddings] == [*wanted, ("hog", 0)]
-    assert embeddings[0].training == embeddings[2].training  # codes are of the same runs
-    for place, job in enumerate(jobs):
-        assert job.training is None or job.training in jobs[:place]
+    jobs = list(states_of(read()))
+    assert [job for job in jobs if job.startswith("train")] == [
+        f"train {method} on {where}{seed}"
+        for where in ("faces", "cars")
+        for method in ("ours", "small vqvae")
+        for seed in ("", ", seed 1")
+    ]
+    wanted = [
+        f"embed {name} of lfw{seed}" for name in ("ours", "codes", "small vqvae") for seed in ("", ", seed 1")
+    ]
+    assert [job for job in jobs if "of lfw" in job] == [*wanted, "embed hog of lfw"]
+    for where, scored in (("faces", "lfw"), ("cars", "police")):
+        end = jobs.index(f"score {scored}")
+        assert all(jobs.index(job) < end for job in jobs if job.endswith((f"on {where}", f"of {scored}")))
+        assert jobs.index(f"train ours on {where}") < jobs.index(f"embed ours of {scored}")
 
 
 def test_toml_says_the_same(read):
@@ -68,29 +73,36 @@ label = "identity"
 """
     plan = read(text, "plan.toml")
     assert plan.score["lfw"].label == ("identity",)
-    assert [job.kind for job in jobs_of(plan)] == ["embed"]
+    assert states_of(plan) == {"embed hog of lfw": "to do", "score lfw": "to do"}
 
 
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
         ("images: 1000", "image: 1000", "unknown setting 'image'; did you mean 'images'"),
-        ("small vqvae: {kind: vqvae", "x: {kind: vqvea", "no known kind; did you mean 'vqvae'"),
+        (
+            "small vqvae: {kind: vqvae",
+            "x: {kind: vqvea",
+            "unknown kind of method 'vqvea'; did you mean 'vqvae'",
+        ),
         ("like: ours", "like: our", "unknown like 'our'; did you mean 'ours'"),
         ("width: 416", "widht: 416", "unknown setting 'widht'; did you mean 'model.width'"),
         ("width: 416", "seed: 3", "seed is the plan's own"),
         ("{precision: bf16-mixed}", "{precision: bf17}", "setting 'precision'"),
         ("trained_on: faces", "trained_on: face", "unknown training set 'face'; did you mean 'faces'"),
-        (", trained_on: faces", "", "score 'lfw' needs trained_on: 'ours'"),
-        ("table: identity", "table: identities", "unknown table 'identities'; did you mean 'identity'"),
-        ("table: identity", "table: segmentation", "segmentation trains nets of its own"),
+        (", trained_on: faces", "", "score 'lfw' needs trained_on: the training set of ours"),
+        ("table: identity", "table: identities", "Input should be 'clustering', 'identity'"),
+        ("table: identity", "table: segmentation", "got 'segmentation'"),
         ("table: identity", "table: identity, label: x", "needs a table (identity, emotion, ...) or a label"),
-        ("table: identity", "table: identity, min_count: 3", "go with label, not with table"),
-        ("trained_on: faces", "trained_on: faces, part: test", "is of faces.zip, the images of 'faces'"),
-        ("data: lfw.zip", "data: faces.zip, part: test", "part goes with seeds: 1"),
-        ("  lfw:", "  ../lfw:", "cannot be a folder's"),
+        (
+            "trained_on: faces",
+            "trained_on: faces, part: test",
+            "needs seeds: 1 and the data, dataset and limit of 'faces'",
+        ),
+        ("data: lfw.zip", "data: faces.zip, part: test", "needs seeds: 1 and the data"),
+        ("  lfw:", "  ../lfw:", "String should match pattern"),
         ("  hog:", "  hog: {settings: {a: 1}}", "(hog) is not trained here"),
-        ("whitened: false", "whitened: false, model: x", "it takes features and whitened alone"),
+        ("whitened: false", "whitened: false, model: x", "is like 'ours': leave out model"),
         ("score:", "score: [", "cannot be read as a plan"),
     ],
 )
