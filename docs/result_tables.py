@@ -130,18 +130,6 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
     return read
 
 
-def million_rows(result: Any) -> Iterator[list[str]]:
-    yield ["1,000,000 rows of 128, one thread", "seconds"]
-    names = {
-        "faiss_build": f"FAISS, index of {result['lists']:,} cells",
-        "faiss_search": f"FAISS, {result['queries']} queries, recall {result['recall']}",
-        "exact_search": f"exact, {result['queries']} queries",
-        "duckdb_nearest_one": "DuckDB, one exact query",
-        "duckdb_count": "DuckDB, rows of each kind",
-    }
-    yield from ([name, f"{result['seconds'][key]:.2f}"] for key, name in names.items())
-
-
 def with_steps(read: Callable[[Any], Iterator[list[str]]], file: str) -> Callable[[Any], Iterator[list[str]]]:
     """The rows of a table, above them its first row with 60 steps per image, from a file of its own."""
 
@@ -292,19 +280,20 @@ def swapped(result: Any) -> Iterator[list[str]]:
     yield ["nothing exchanged, rendered and encoded again", *unexchanged]
 
 
-def page_speed(result: Any) -> Iterator[list[str]]:
-    yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
-    for row in result["rows"]:
-        cells = (row[key] for key in ("pictures_per_cpu_second", "cpu_ms", "server_mb"))
-        yield [f"{row['size']} pixels, {row['clients']}", *(f"{cell:,.0f}" for cell in cells)]
-
-
 def aligned(result: Any) -> Iterator[list[str]]:
     yield ["faces found", "recall", "precision", "eye error, mean", "90th percentile"]
     for group in ("pasted", "lfw crops"):
         for name, row in result[group].items():
             keys = ("recall", "precision", "eye_error_mean", "eye_error_90th")
             yield [f"{group}: {name}", *(f"{row[key]:.3f}" for key in keys)]
+
+
+def framings(result: Any) -> Iterator[list[str]]:
+    """Cosine of features between crops of one image, beside that of two people."""
+    yield ["features of one image", "cosine, mean", "lowest pair, mean", "two people"]
+    for name, row in result["framings"].items():
+        keys = ("cosine_mean", "cosine_lowest_mean", "cosine_of_two_people")
+        yield [name, *(f"{row[key]:.3f}" for key in keys)]
 
 
 def angles(result: Any) -> Iterator[list[str]]:
@@ -386,9 +375,10 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "renderers-clear": ("renderers_train.json", lambda result: drawn.renderers_trained(result, clear=True)),
     "renderers-numbers": ("renderers_train.json", drawn.effect_numbers),
     "renderers-yale": ("renderers_yaleb.json", drawn.renderers_yale),
-    "table-million": ("table_million.json", million_rows),
-    "view": ("view.json", page_speed),
+    "table-million": ("table_million.json", speed.million_rows),
+    "view": ("view.json", speed.page_speed),
     "align": ("align.json", aligned),
+    "framings": ("align.json", framings),
     "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
     "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
     "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),

@@ -116,3 +116,22 @@ def gpu_agreement(result: Any) -> Iterator[list[str]]:
     for row in result["agreement"]:
         errors = row["image"], row["depth"], row["mask"], max(row[key] for key in gradients)
         yield [f"{row['size']} px, {row['dtype']}", *(f"{error:.0e}" if error else "0" for error in errors)]
+
+
+def million_rows(result: Any) -> Iterator[list[str]]:
+    yield ["1,000,000 rows of 128, one thread", "seconds"]
+    names = {
+        "faiss_build": f"FAISS, index of {result['lists']:,} cells",
+        "faiss_search": f"FAISS, {result['queries']} queries, recall {result['recall']}",
+        "exact_search": f"exact, {result['queries']} queries",
+        "duckdb_nearest_one": "DuckDB, one exact query",
+        "duckdb_count": "DuckDB, rows of each kind",
+    }
+    yield from ([name, f"{result['seconds'][key]:.2f}"] for key, name in names.items())
+
+
+def page_speed(result: Any) -> Iterator[list[str]]:
+    yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
+    for row in result["rows"]:
+        cells = (row[key] for key in ("pictures_per_cpu_second", "cpu_ms", "server_mb"))
+        yield [f"{row['size']} pixels, {row['clients']}", *(f"{cell:,.0f}" for cell in cells)]
