@@ -194,6 +194,17 @@ ROBUST = {
 PAPER = {"clustering": "attributes", "emotion": "emotion", "identity": "identity"}
 
 
+def part(name: str, digits: Mapping[str, int]) -> Callable[[Any], Iterator[list[str]]]:
+    """One part of a file as it is, its rows by name."""
+
+    def read(result: Any) -> Iterator[list[str]]:
+        yield ["", *digits]
+        for row, scores in result[name].items():
+            yield [row, *(f"{scores[key]:.{number}f}" for key, number in digits.items())]
+
+    return read
+
+
 def probed(result: Any) -> Iterator[list[str]]:
     """Balanced accuracy of each probe and number of labels."""
     names = [name for name in result["parts"][0]["rows"] if name not in ("majority", "chance")]
@@ -360,6 +371,9 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
     "celeba-labels": ("published/celeba-labels.json", probed),
     "robustness-generated": (" ".join(ROBUST.values()), turned_and_lit),
     "paper-clustering": (" ".join(f"published/compare-{one}.json" for one in PAPER), beside_the_paper),
+    "demo-depth": ("demo.json", part("geometry", {"SIDE x 100": 3, "MAD": 1})),
+    "demo-people": ("demo.json", part("clustering", {"accuracy": 3, "NMI": 3})),
+    "demo-images": ("demo.json", part("reconstruction", {"L1": 4, "PSNR": 2, "SSIM": 3})),
     "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
     "paper-gpu": ("paper-gpu.json", paper_preset),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
