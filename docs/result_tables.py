@@ -337,8 +337,7 @@ HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
     "view 15": "view 15°",
     "view 30": "view 30°",
 }
-# by table: its files, of which the first is read for it, and its reader
-FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {
+FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files, the first for the reader
     "edits-yale": ("photo_edits.json", edits("yale", LIGHTS)),
     "edits-heads": ("photo_edits.json", edits("generated heads", HEADS)),
     "training-step": ("training_step.json", speed.training_step),

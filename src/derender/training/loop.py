@@ -223,7 +223,7 @@ class _Run:
         """
         noise = self.noise if noise is None else noise
         assert noise is not None
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad(set_to_none=True)  # a recording that failed may have left some
         result = compute_step(self.module, images, noise, self.precision, done, rows)
         self.fabric.backward(result.total)
         gradients, largest = largest_gradients(self.model)

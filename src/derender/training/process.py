@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +117,7 @@ def locked(run: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if made and [entry.name for entry in run.iterdir()] in ([], [LOCK_FILE]):
-            shutil.rmtree(run, ignore_errors=True)  # before another can hold its lock
+        with suppress(OSError):  # a folder that has gone hides no error of the block
+            if made and [entry.name for entry in run.iterdir()] in ([], [LOCK_FILE]):
+                shutil.rmtree(run, ignore_errors=True)  # before another can hold its lock
         lock.release()
