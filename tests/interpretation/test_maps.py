@@ -11,6 +11,7 @@ from derender.interpretation.probe import Probe
 from derender.model import Derenderer
 from derender.networks.encoders import activations
 from derender.postprocess import Features
+from derender.postprocess.embedding import gradient_directions
 from derender.postprocess.whitening import Projection, Whitening
 from derender.presets import MODEL_PRESETS
 
@@ -130,6 +131,20 @@ def test_features_of_both_sides_give_a_mirrored_picture_the_mirrored_map(model, 
         own, mirror = (saliency(method, mirroring, one, "albedo", probe, [0, 1, 0]) for one in sides)
         torch.testing.assert_close(own, mirror.flip(-1), rtol=1e-3, atol=1e-5)
         assert not torch.allclose(own, own.flip(-1), rtol=1e-2)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_directions_of_gradients_that_count_for_nothing_change_no_map(model, probe, images, method):
+    plain = model.activations(images[:1])["albedo"].shape[1]
+    both = plain + gradient_directions(images[:1]).shape[1]  # as in the bundled faces-64
+    chart = torch.randn(both, CODE, generator=torch.Generator().manual_seed(0))
+    chart[plain:] = 0
+    maps = []
+    for width in (plain, both):
+        whitening = Whitening({"albedo": Projection(torch.zeros(width), chart[:width], torch.ones(CODE))})
+        featured = model.with_features(Features(whitening))
+        maps.append(saliency(method, featured, images, "albedo", probe, [0, 1, 0]))
+    torch.testing.assert_close(maps[0], maps[1])
 
 
 def test_new_weights_change_the_map_and_the_same_weights_do_not(model, probe, images):

@@ -30,7 +30,6 @@ from torch.nn.functional import interpolate
 from derender.baselines.controls import untrained_twin
 from derender.evaluation.pixels import masked_ssim
 from derender.interpretation.probe import Probe
-from derender.networks.encoders import activations
 from derender.storage.places import optional, require_known
 
 OUTPUTS = ("logit", "probability")
@@ -134,16 +133,18 @@ def _at_features(
 
     Where the feature is made of images and their mirror images, those of the mirror images follow.
     """
-    encoder, mirrors = model.nets[factor].encoder, model.features.mirrors(factor)
-    seen = torch.cat([images, images.flip(-1)]) if mirrors else images
+    seen: list[Tensor] = []
     with torch.enable_grad():
-        features = encoder.spatial(seen).detach().requires_grad_()
-        active = activations(encoder.to_code(features).flatten(1), features)
-        if mirrors:
-            active = torch.cat(active.chunk(2), dim=1)
+        hook = model.nets[factor].encoder.to_code.register_forward_pre_hook(
+            lambda _, inputs: seen.append(inputs[0].requires_grad_())
+        )
+        try:
+            active = model.factor_activations(factor, images)
+        finally:
+            hook.remove()
         answer = score(model.features_from({factor: active})[factor], weight).sum()
-        (gradient,) = torch.autograd.grad(answer, features)
-    return features.detach(), gradient
+        gradients = torch.autograd.grad(answer, seen)
+    return torch.cat(seen).detach(), torch.cat(gradients)
 
 
 def pixel_attribution(
