@@ -134,7 +134,9 @@ def test_embed_then_cluster(trained, faces, tmp_path, numbers):
     assert list(result["rows"]) == ["geometry + albedo", "majority", "chance"]
     assert 0 < result["rows"]["chance"]["scores"]["accuracy"]["value"] <= 1
     rows = numbers(*words, "-m", trained, "-d", faces, "--cache", "none")[0]["rows"]
-    controls = ["untrained encoder", "PCA (10)", "pixels", "Gradientfaces", "HOG", "LBP"]
+    controls = ["untrained encoder", "PCA (10)", "pixels"]
+    for name in ("Gradientfaces", "HOG", "LBP"):
+        controls += [name, f"{name} with mirror image"]
     controls += ["majority", "chance"]
     assert [name for name, row in rows.items() if row["control"]] == controls
     assert list(rows) == ["geometry + albedo", *controls] and rows["untrained encoder"]["runs"] == 3

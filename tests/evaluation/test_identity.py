@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
+from derender.baselines.controls import DESCRIPTORS
 from derender.data import ImageSet, half_of
 from derender.evaluation import area_under_roc, identify, read_pairs, verify
+from derender.evaluation.controls import control_rows
+from derender.evaluation.options import Options
 from derender.features import FeatureTable
 
 RNG = np.random.default_rng(0)
@@ -130,7 +133,16 @@ def test_controls_stand_beside_a_model_of_faces(tmp_path):
     pictures = ImageSet(images, tuple(f"{row}.png" for row in range(len(who))), {"identity": who})
     result = identify(model, images=pictures, untrained_seeds=1, resamples=20, cache="none")
     assert list(result.values["rows"]) == [
-        "geometry + albedo", "untrained encoder", "PCA (6)", "pixels", "Gradientfaces", "HOG", "LBP",
-        "chance",
+        "geometry + albedo", "untrained encoder", "PCA (6)", "pixels",
+        "Gradientfaces", "Gradientfaces with mirror image", "HOG", "HOG with mirror image",
+        "LBP", "LBP with mirror image", "chance",
     ]  # fmt: skip
     assert any("PCA (6), whitened, is fitted to 24 images" in note for note in result.notes)
+    rows = control_rows(pictures, None, Options(descriptors=True))
+    shown = {row.name: row.tables[0].factors for row in rows}
+    turned = ImageSet(images[..., ::-1].copy(), pictures.files)
+    for name, describe in DESCRIPTORS.items():
+        alone = [describe(one).factors[name] for one in (pictures, turned)]
+        title = next(title for title in shown if title.lower() == name)
+        np.testing.assert_array_equal(shown[title][name], alone[0])
+        np.testing.assert_allclose(shown[f"{title} with mirror image"][name], np.mean(alone, axis=0))

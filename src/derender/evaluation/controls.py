@@ -1,28 +1,19 @@
 """Controls that every score of features stands beside, made of the same images under the same protocol.
 
 Without learning: an untrained encoder of the same architecture (several seeds), principal components and
-the pixels themselves; of identity tables also descriptors.
+the pixels themselves. Identity tables also have descriptors, of the image alone and averaged with those of
+its mirror image: whitened features see both.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
 from pydantic import ValidationError
 
-from derender.baselines.controls import (
-    DESCRIPTORS,
-    control_table,
-    pca_features,
-    pixel_features,
-)
+from derender.baselines.controls import DESCRIPTORS, control_table, pca_features, pixel_features
 from derender.data import ImageSet
-from derender.evaluation.feature_rows import (
-    FeatureRow,
-    FeatureSource,
-    check_rows,
-    embedded_table,
-    one_row,
-)
+from derender.evaluation.feature_rows import FeatureRow, FeatureSource, check_rows, embedded_table, one_row
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import component_count
 from derender.inputs import device_named
@@ -80,10 +71,14 @@ def control_rows(
     for name, describe in DESCRIPTORS.items() if options.descriptors else ():
         try:
             table = describe(images, progress=options.stage(name))
+            mirrored = replace(images, images=np.ascontiguousarray(images.images[..., ::-1]))
+            other = describe(mirrored, progress=options.stage(f"{name} of mirror images"))
         except ValueError as error:  # a package is missing, or images are smaller than a cell
             options.notes.append(f"{name} left out: {error}")
         else:
+            both = replace(table, factors={name: (table.factors[name] + other.factors[name]) / 2})
             rows.append(FeatureRow(_SHOWN[name], (table,), control=True))
+            rows.append(FeatureRow(f"{_SHOWN[name]} with mirror image", (both,), control=True))
     return rows
 
 

@@ -30,7 +30,8 @@ class Options:
         resamples: bootstrap resamples of the rows.
         seed: the first seed of every random choice: resamples, subsets, k-means, untrained encoders.
         keep_duplicates: of identical images keep every one.
-        descriptors: also compare with Gradientfaces, HOG and LBP, as tables of identity do.
+        descriptors: also compare with Gradientfaces, HOG and LBP, alone and with mirror images, as tables
+            of identity do.
         dataset, limit: how an address of images is read, see ``derender.inputs.as_images``.
         device: of models that are loaded here.
         cache: folder of cached results, "none" for none; by default the user's.
