@@ -103,6 +103,15 @@ def test_swap_of_a_picture_with_itself_changes_nothing(tiny, photos, tmp_path):
     assert (out / "0" / "still-01.png").read_bytes() not in images
 
 
+@pytest.mark.parametrize("edit", [["relight"], ["rotate"], ["swap", "--from", "1.png"]])
+def test_edits_in_the_models_albedo_are_drawn_at_their_size(edit, tiny, photos, tmp_path, monkeypatch):
+    monkeypatch.chdir(photos)
+    words = ["0.png", "-m", tiny, "-o", tmp_path / "out", "--detail", "model", "--size", 48]
+    assert run(*edit, *words) == 0
+    with Image.open(tmp_path / "out" / "0" / "still-01.png") as still:
+        assert still.size == (48, 48)
+
+
 def test_mesh_opens_elsewhere_and_takes_the_pictures_own_texture(tiny, photos, tmp_path):
     for name, detail in {"own": [], "model": ["--detail", "model"], "old": ["--texture", "original"]}.items():
         words = ["mesh", "-m", tiny, photos / "0.png", "-o", tmp_path / name, "--size", 48, *detail]

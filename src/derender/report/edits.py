@@ -216,7 +216,8 @@ def _swept(
 
 def _inputs(model: Derenderer, image: OpenedImage, other: OpenedImage | None) -> dict[str, Image.Image]:
     height, width = image.shown.shape[-2:]
-    scene = at_size(image.scene, width if width == height else EDIT_SIZE)
+    side = max(image.scene.depth.shape[-1], width if width == height else EDIT_SIZE)
+    scene = at_size(image.scene, side)
     shown = {"input": pictures(image.shown[None])[0], "reconstruction": sweeps.drawn(scene, model.render)[0]}
     return shown if other is None else {**shown, "the other": pictures(other.shown[None])[0]}
 
