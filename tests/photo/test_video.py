@@ -64,8 +64,14 @@ def test_a_film_is_relit_where_its_face_is(film, tmp_path, capsys):
     change = np.abs(read(tmp_path / "out" / "film" / "film.mp4").astype(int) - read(film))
     first, last = change[0].mean(axis=(0, 2)), change[-1].mean(axis=(0, 2))
     assert first[40:120].mean() > 4 * first[200:].mean() and last[110:190].mean() > 4 * last[:30].mean()
+    (tmp_path / "none.mp4").write_bytes(b"no film")
+    (tmp_path / "none.png").write_bytes(b"no image")
+    named = [str(film), *(str(tmp_path / name) for name in ("none.mp4", "none.png"))]
+    words = [*words[:3], *named, "-o", str(tmp_path / "two")]
+    assert main(words) == 2  # the others are edited
+    assert capsys.readouterr().err.count("left out") == 2
+    assert [folder.name for folder in (tmp_path / "two").iterdir()] == ["film"]
     assert main(["mesh", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "mesh")]) == 2
     assert "is a video" in capsys.readouterr().err
     with pytest.raises(ValueError, match="cannot be read as a video"):
-        (tmp_path / "none.mp4").write_bytes(b"no film")
         edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict)

@@ -136,7 +136,8 @@ def write_images(
     moving = [file for file in files if is_video(file)]
     if moving and video is None:
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
-    read, refused = readable([file for file in files if file not in moving], opener.read, progress)
+    images_only = [file for file in files if file not in moving]
+    read, refused = readable(images_only, opener.read, progress, needed=not moving)
     shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
     shown = {file: row for file, row in shown.items() if not is_video(file)}
     with_sheet = len(shown) > 1 if sheet is None else sheet
@@ -156,14 +157,20 @@ def write_images(
         progress(len(records), len(images), description="drawing")
     for path in moving:
         assert video is not None
-        with atomic_folder(places[path]) as temporary:
-            film = edit_video(
-                path, temporary / FILM, opener.model, video, frame=opener.options.frame,
-                fit_steps=opener.options.fit_steps, progress=progress,
-            )  # fmt: skip
-            record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
-            (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
-        records.append(record)
+        try:
+            with atomic_folder(places[path]) as temporary:
+                film = edit_video(
+                    path, temporary / FILM, opener.model, video, frame=opener.options.frame,
+                    fit_steps=opener.options.fit_steps, progress=progress,
+                )  # fmt: skip
+                record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
+                (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+        except (ValueError, OSError) as problem:
+            refused[str(path)] = " ".join(str(problem).split())
+        else:
+            records.append(record)
+    if refused and not records:
+        raise ValueError(next(iter(refused.values())))
     rows = [(file.name, _row(row)) for file, row in shown.items()] if with_sheet else []
     rows = [row for row in rows if row[1]]
     files = _sheet_files(out, len(rows))

@@ -164,9 +164,10 @@ def image_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def readable(
-    paths: Sequence[Path], read: Callable[[Path], T], progress: Callable[..., object] | None = None
-) -> tuple[dict[Path, T], dict[str, str]]:
-    """Every file that can be read, and reasons why the others cannot; none at all is an error."""
+    paths: Sequence[Path], read: Callable[[Path], T], progress: Callable[..., object] | None = None,
+    needed: bool = True,
+) -> tuple[dict[Path, T], dict[str, str]]:  # fmt: skip
+    """Every file that can be read, and why the others cannot; none is an error where one is ``needed``."""
     result: dict[Path, T] = {}
     refused: dict[str, str] = {}
     for number, path in enumerate(paths):
@@ -176,7 +177,7 @@ def readable(
             result[path] = read(path)
         except (ValueError, OSError) as problem:
             refused[str(path)] = " ".join(str(problem).split())
-    if refused and not result:
+    if needed and refused and not result:
         raise ValueError(next(iter(refused.values())))
     return result, refused
 
