@@ -133,6 +133,8 @@ def test_what_cannot_be_distilled_is_named(model, images):
         unets.distil_unets(model, images[:1])
     with pytest.raises(ValueError, match="got 24 of 16"):
         unets.distil_unets(model, images[..., :16, :16])
+    with pytest.raises(ValueError, match="a model grown from 64 pixels takes no U-Nets"):
+        unets.distil_unets(derender.load("faces-128"), torch.zeros(2, 3, 128, 128, dtype=torch.uint8))
 
 
 def test_weights_that_are_no_numbers_are_an_error(model, images):

@@ -75,7 +75,7 @@ def distil_unets(
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
     neither read nor changed. A ValueError are fewer than two images, images of another size, a model that
-    lacks a factor, and weights that end as NaN or infinity.
+    was grown or lacks a factor, and weights that end as NaN or infinity.
     """
     settings = settings or UNetSettings()
     if len(images) < 2 or images.shape[-1] != model.image_size:
@@ -83,6 +83,8 @@ def distil_unets(
             f"U-Nets need 2 images or more of {model.image_size} pixels to learn from, got {len(images)} of "
             f"{images.shape[-1]}"
         )
+    if (smaller := model.settings.network.grown_from) is not None:
+        raise ValueError(f"a model grown from {smaller} pixels takes no U-Nets: give the smaller model")
     for name in PIXEL_CHANNELS:
         if name not in model.nets:
             raise ValueError(f"the model has no {name}: U-Nets learn the paper's factors only")
