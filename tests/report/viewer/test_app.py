@@ -222,6 +222,8 @@ def test_further_factors_move_and_swap(renderer):
     studio, noise = Studio(model.eval(), "tiny"), np.random.default_rng(0)
     one, two = (studio.open(noise.integers(0, 256, (48, 48, 3), dtype=np.uint8)) for _ in range(2))
     about, asked = studio.about(), ViewRequest(picture=one["picture"])
+    with pytest.raises(Refused, match="cannot optimise scenes per image"):
+        studio.again(CropRequest(picture=one["picture"], fit=True))
     maps = studio.maps(asked)
     assert set(about["maps"]) < set(maps) and zipfile.is_zipfile(io.BytesIO(studio.archive(asked)))
     if renderer == "sh":

@@ -121,6 +121,8 @@ class Studio:
     def again(self, question: CropRequest) -> dict[str, Any]:
         """An opened image decomposed again: another crop, or its scene optimised; returns as `open` does."""
         opened, crop = self.shelf.get(question.picture), question.crop
+        if question.fit and self.model.fitting is None:
+            raise Refused(422, "fit: this model cannot optimise scenes per image; ask without it")
         frame, framed, (height, width) = opened.frame, opened.framed, opened.photo.shape[:2]
         if isinstance(crop, Place):
             side = min(crop.side, 2.0 * max(height, width))
