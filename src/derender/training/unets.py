@@ -74,8 +74,8 @@ def distil_unets(
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
 
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
-    neither read nor changed. A ValueError are fewer than two images, images of another size, a model that
-    was grown or lacks a factor, and weights that end as NaN or infinity.
+    neither read nor changed. A ValueError are fewer than two images, images of another size, a grown model,
+    one that lacks a factor, and weights of NaN or infinity.
     """
     settings = settings or UNetSettings()
     if len(images) < 2 or images.shape[-1] != model.image_size:
