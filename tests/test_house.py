@@ -18,7 +18,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (7_430, 32),
     "evaluation": (7_620, 38),  # public functions name their errors
-    "report": (4_020, 25),
+    "report": (4_030, 25),
     "cli": (2_300, 32),
     "training": (3_510, 17),  # CUDA graphs
     "baselines": (2_470, 11),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (660, 8),
     "learn": (930, 5),
 }
-TOTAL = (39_540, 248)  # on the way to (37_000, 270)
+TOTAL = (39_560, 248)  # on the way to (37_000, 270)
 TEST_LINES = 25_640
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

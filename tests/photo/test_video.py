@@ -75,3 +75,5 @@ def test_a_film_is_relit_where_its_face_is(film, tmp_path, capsys):
     assert "is a video" in capsys.readouterr().err
     with pytest.raises(ValueError, match="cannot be read as a video"):
         edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict)
+    with pytest.raises(ValueError, match="unknown frame of a video 'auto': choose face or none"):
+        edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict, frame="auto")

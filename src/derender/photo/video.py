@@ -25,6 +25,7 @@ from derender.photo.faces import UTKFACE, find_faces, frame_of, template_of
 from derender.photo.frame import Frame
 from derender.scene import Scene
 from derender.storage.atomic import atomic_file
+from derender.storage.places import require_known
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
 SEARCH_EVERY_SECONDS = 0.2
@@ -70,9 +71,10 @@ def edit_video(
         progress: called with (frames done, frames in all) and what is being done as ``description``.
 
     Raises:
-        ValueError: no video, one that is too long, or none of its frames shows a face.
+        ValueError: no video, one that is too long, another ``frame``, or none of its frames shows a face.
     """
     video, out, report = Path(video), Path(out), progress or (lambda *_, **__: None)
+    require_known("frame of a video", frame or "none", ("face", "none"))
     import cv2
 
     reader = _opened(video)

@@ -70,7 +70,7 @@ class WrittenImages:
         if (more := len(lines) - NAMED) > 0:
             lines[NAMED:] = [f"and {more:,} more (--json names all)"]
         if self.before:
-            lines.append(f"{self.before:,} images were done before")
+            lines.append(f"{self.before:,} done before")
         if self.percentiles:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
