@@ -16,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (7_430, 32),
+    "data": (7_440, 32),
     "evaluation": (7_620, 38),  # public functions name their errors
     "report": (4_030, 25),
     "cli": (2_300, 32),
@@ -33,9 +33,9 @@ BUDGET = {  # lines, files
     "scene": (860, 11),
     "demo": (520, 3),
     "renderers": (660, 8),
-    "learn": (930, 5),
+    "learn": (940, 5),
 }
-TOTAL = (39_560, 248)  # on the way to (37_000, 270)
+TOTAL = (39_580, 248)  # on the way to (37_000, 270)
 TEST_LINES = 25_640
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -10,6 +10,7 @@ import derender
 from derender.cli import main
 from derender.data import read_images
 from derender.data.synthetic import faces
+from derender.storage.places import model_folder
 from derender.training.held_out_errors import read_errors
 
 KNOWN = "rendered-faces-64"
@@ -46,6 +47,7 @@ def test_a_whitened_copy_has_other_features_and_the_same_scenes(folder, tmp_path
     assert torch.linalg.matrix_rank(two.whitening.get_buffer("albedo_map"), rtol=1e-3) == 8
     image = torch.rand(1, 3, 64, 64)
     assert torch.equal(one.decompose(image).depth, two.decompose(image).depth)
+    assert read_errors(tmp_path / "mine") == read_errors(model_folder(KNOWN)) is not None
     assert not torch.equal(one.embed(image)["albedo"], two.embed(image)["albedo"])
 
 

@@ -143,6 +143,8 @@ def test_parts_of_pairs_and_images_without_their_maps(pairs, tree):
     path = pairs(names=("a", "a"))
     assert len(read_ground_truth(f"{path}::train")) == 2
     assert len(read_ground_truth(path, "test", limit=1)) == 1
+    every = read_ground_truth(path, "test").files
+    assert len(every) == 3 and read_ground_truth(path, "test", limit=2).files == every[::2]  # evenly spaced
     with pytest.raises(ValueError, match="no part 'val': its parts are test, train"):
         read_ground_truth(path, "val")
     images = read_images(path, SIZE, keep_duplicates=True)

@@ -154,8 +154,8 @@ def test_a_model_that_knows_the_truth_scores_best_beside_its_controls():
 
 
 def test_controls_on_rendered_faces_reach_what_is_known(shared_data):
-    """Average depth 1.51e-2 and 22.4 degrees, plane 2.28e-2 and 38.9 over all 800 images; here over 200."""
-    truth = read_ground_truth(shared_data("data/synface64.zip"), limit=200)
+    """Average depth 1.51e-2 and 22.4 degrees, plane 2.28e-2 and 38.9 over all 800 images; here over 400."""
+    truth = read_ground_truth(shared_data("data/synface64.zip"), limit=400)
     knows = Oracle(torch.as_tensor(truth.depth), torch.as_tensor(truth.mask).float())
     result = evaluate_geometry(knows, truth)
     average, plane_scores = result.average_depth, result.plane

@@ -26,7 +26,7 @@ from derender.data.layouts import layout_named
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
-from derender.data.opening import list_images, open_source, parse_source
+from derender.data.opening import evenly_spaced, list_images, open_source, parse_source
 from derender.data.source import Source
 from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
@@ -138,7 +138,7 @@ def read_ground_truth(
         source: a folder or zip in synface64's format or with folders ``image`` and ``depth``, or
             ``PATH::SUBSET``.
         subset: "test_gt" or "test" by default, or the only subset there is.
-        limit: only the first so many.
+        limit: at most so many, evenly spaced.
         image_size: side to bring images and maps to, where the set is images beside depth maps alone. A set
             in synface64's format is read at the size it was rendered in.
     """
@@ -149,7 +149,8 @@ def read_ground_truth(
         table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
         table = half_of(table, options.get("half", "all"))
         if pairs:
-            return _read_pairs(opened, {file: pairs[file] for file in table.files[:limit]}, image_size)
+            chosen = [table.files[row] for row in evenly_spaced(len(table.files), limit)]
+            return _read_pairs(opened, {file: pairs[file] for file in chosen}, image_size)
         return _read_maps(opened, table, limit)
 
 
@@ -226,11 +227,11 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
     def map_names(kind: str) -> list[str]:
         return [f"{file.rpartition('images/')[0]}{kind}/{stem_of(file)}.png" for file in table.files]
 
-    with_depth = [row for row, name in enumerate(map_names("depth")) if name in known][:limit]
-    if not with_depth:
+    with_depth = np.flatnonzero([name in known for name in map_names("depth")])
+    if not len(with_depth):
         expected = "; ".join(map_names("depth")[:1])
         raise ValueError(f"{source.path} has no depth maps for its images (expected {expected})")
-    table = table.select(np.array(with_depth))
+    table = table.select(with_depth[evenly_spaced(len(with_depth), limit)])
     missing = [name for name in (*LIGHT, *CAMERA) if name not in table.labels]
     if missing:
         raise ValueError(f"the params.csv in {source.path} lacks the column for {missing[0]!r}")

@@ -12,11 +12,12 @@ from derender.inputs import as_images, as_model, copy_split
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.model import Derenderer
 from derender.storage.atomic import new_folder
+from derender.storage.places import model_folder
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.distillation import RefineConfig
 from derender.training.distillation import refine as distil
 from derender.training.features import make_features, recentre
-from derender.training.held_out_errors import store_errors
+from derender.training.held_out_errors import read_errors, store_errors, write_errors
 from derender.training.unets import UNetSettings, distil_unets
 
 _SETTINGS = {"whiten": FeatureSettings, "refine": RefineConfig, "unet": UNetSettings}
@@ -47,8 +48,8 @@ def whiten(
 ) -> ModelCopy:  # fmt: skip
     """A copy of a model whose features move as little as possible with other factors.
 
-    Whitening and fitting are estimated on these images, without labels. Weights and scenes stay as they are.
-    Training ends with this by itself.
+    Whitening, fitting and the brightness prior are estimated on these images, without labels. Weights and
+    reconstructions stay as they are. Training ends with this by itself.
 
     Args:
         model: trained, or where it is.
@@ -75,7 +76,7 @@ def whiten(
         made = make_features(work.model, work.pixels, features, seed=seed, progress=work.progress)
     assert made.whitening is not None
     ratios = {name: made.whitening.get_buffer(f"{name}_ratios").tolist() for name in made.whitening.names}
-    return work.saved(made, {"between_over_within": ratios})
+    return work.saved(made, {"between_over_within": ratios}, same_errors=True)
 
 
 def refine(
@@ -140,10 +141,12 @@ class _Copying:
             on_images(self.images)
 
     def saved(
-        self, made: Derenderer, scores: dict[str, Any], *, split: bool = True, held_out: Tensor | None = None
-    ) -> ModelCopy:
-        """Save the copy with the errors of held-out images, and with ``split`` that of the original: other
-        images were not seen. Complete or not at all.
+        self, made: Derenderer, scores: dict[str, Any], *, split: bool = True, held_out: Tensor | None = None,
+        same_errors: bool = False,
+    ) -> ModelCopy:  # fmt: skip
+        """Save the copy with the errors of held-out images, those of the original where they are the
+        ``same_errors``, and with ``split`` that of the original: other images were not seen. Complete or not
+        at all.
         """
         with new_folder(self.out, overwrite=self.overwrite) as folder:
             made.write(folder)
@@ -151,4 +154,7 @@ class _Copying:
                 copy_split(folder, self.source)
             if held_out is not None:
                 store_errors(folder, held_out)
+            kept = read_errors(model_folder(self.source)) if same_errors and self.source is not None else None
+            if kept is not None:
+                write_errors(folder, kept)
         return ModelCopy(self.out, made, len(self.images), scores)
