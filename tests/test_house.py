@@ -29,14 +29,14 @@ BUDGET = {  # lines, files
     "networks": (710, 5),
     "storage": (940, 8),
     "objectives": (640, 5),
-    "postprocess": (740, 6),
+    "postprocess": (790, 6),
     "scene": (860, 11),
     "demo": (520, 3),
     "renderers": (660, 8),
     "learn": (940, 5),
 }
-TOTAL = (39_580, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_640
+TOTAL = (39_630, 248)  # on the way to (37_000, 270)
+TEST_LINES = 25_680
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from derender.postprocess.whitening import Scatter, Whitening, fit_projection
+from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
 
 VIEWS, IMAGES, SIZE = 5, 400, 12
 
@@ -97,6 +97,18 @@ def test_features_stand_in_the_place_of_the_code_that_they_are_nearest_to():
     together = torch.corrcoef(torch.cat([codes.flatten(0, 1), features], dim=1).T)[:4, 4:]
     assert (together.diagonal() > 0.95).all()
     assert (together - torch.diag(together.diagonal())).abs().max() < 0.3
+
+
+def test_activations_side_by_side_weigh_alike_in_features_of_their_own(codes):
+    both = [Scatter().add(codes), Scatter().add(100 * codes[..., :3])]
+    result = fit_side_by_side(both, 4, 0.1, 5, 0.0)
+    own = result.map.double()
+    parts = zip(both, (own[:SIZE, :2], own[SIZE:, 2:]), strict=True)
+    first, second = ((part.T @ (one.within + one.between) @ part).trace() for one, part in parts)
+    torch.testing.assert_close(second, first, rtol=1e-5, atol=0)
+    assert not result.map[:SIZE, 2:].any() and not result.map[SIZE:, :2].any()
+    alone = fit_projection(both[0], 4, 0.1, 5, 0.0)
+    torch.testing.assert_close(fit_side_by_side(both[:1], 4, 0.1, 5, 0.0).map, alone.map)
 
 
 def test_codes_that_never_move_are_survived_and_too_few_refused():

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, conv2d, pad
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, conv2d, pad
 
 from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
@@ -33,6 +33,8 @@ FEW, MOST = 4, 64
 CELLS = 32  # of gradient directions along each side
 BLUR_PX, SCALE = 0.75, 0.2  # blur before differences; near the variation of activations (development halves)
 _DARK = 1 / 510  # half a grey level: shorter gradients are noise
+HISTOGRAM_CELLS, ORIENTATIONS = 10, 12  # of histograms of gradients: along each side, and in each
+HISTOGRAMS = HISTOGRAM_CELLS**2 * ORIENTATIONS
 Model = TypeVar("Model", bound="EmbeddingModel")
 
 
@@ -125,7 +127,8 @@ class EmbeddingModel(nn.Module):
     ) -> Float[Tensor, "n _"]:
         """``activations`` for one factor, without coordinates.
 
-        ``gradients``: followed by `gradient_directions`; by default where ``features`` take them.
+        ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default where
+        ``features`` take them.
         """
         parts, images = [], reduced(images, self.settings.network)
         for one in (images, images.flip(-1)) if self.features.mirrors(name) else (images,):
@@ -133,7 +136,7 @@ class EmbeddingModel(nn.Module):
             if self.whitening is not None and name in self.whitening.names and gradients is None:
                 gradients = self.whitening.size(name) > parts[0].shape[1]
             if gradients:
-                parts.append(gradient_directions(one))
+                parts += [gradient_directions(one), gradient_histograms(one)]
         return torch.cat(parts, dim=1)
 
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
@@ -189,6 +192,26 @@ def gradient_directions(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n di
     slope = torch.cat([right, down], dim=1) / 2
     unit = slope / (slope.square().sum(dim=1, keepdim=True).add(1e-10).sqrt() + _DARK)
     return SCALE * adaptive_avg_pool2d(unit, CELLS).flatten(1)
+
+
+def gradient_histograms(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n histograms"]:
+    """Histograms of 12 orientations of the gradient of the mean of colours, in 10x10 cells.
+
+    Each is divided by the root mean square of its 3x3 neighbours, also where it is dark (after Dalal and
+    Triggs, CVPR 2005). Images are in 0..1, at least 10 pixels wide and high. Values lie within 0..0.4.
+    """
+    grey = pad(images.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate")
+    right = grey[..., 1:-1, 2:] - grey[..., 1:-1, :-2]
+    down = grey[..., 2:, 1:-1] - grey[..., :-2, 1:-1]
+    length = (right.square() + down.square() + 1e-10).sqrt()
+    turns = [math.pi * place / ORIENTATIONS for place in range(ORIENTATIONS)]
+    cosine, sine = (constant(tuple(map(one, turns)), images).view(-1, 1, 1) for one in (math.cos, math.sin))
+    along = (right * cosine + down * sine) / length
+    for _ in range(6):  # to the power of 64, which falls to half between two orientations
+        along = along.square()
+    cells = adaptive_avg_pool2d(length * along, HISTOGRAM_CELLS)
+    near = avg_pool2d(pad(cells.square().sum(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate"), 3, 1)
+    return (cells / (near + 1e-10).sqrt()).clamp(max=0.4).flatten(1)
 
 
 def _by_portions(function: Callable[[Tensor], Fitted], images: Float[Tensor, "n 3 h w"]) -> list[Fitted]:

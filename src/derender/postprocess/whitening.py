@@ -5,7 +5,7 @@ Within-class covariance normalisation divides each direction by how much renderi
 The most discriminative directions are kept and made more even (training/features.py renders).
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,6 +103,28 @@ def fit_projection(
     kept = kept * (positive / (1 + positive)) ** power
     left, _, right = torch.linalg.svd(kept.T @ (within + between)[:, :size], full_matrices=False)
     return Projection(mean.float(), (kept @ left @ right).float(), ratios.float())
+
+
+def fit_side_by_side(
+    scatters: Sequence[Scatter], directions: int, shrinkage: float, size: int, evenness: float
+) -> Projection:
+    """One map of several activations side by side, each into its share of ``size`` features.
+
+    Arguments are as of `fit_projection`. The features of all have as much variance as those of the first.
+    """
+    sizes = [(size + place) // len(scatters) for place in range(len(scatters))]
+    fitted = [
+        fit_projection(one, directions, shrinkage, own, evenness)
+        for one, own in zip(scatters, sizes, strict=True)
+    ]
+    maps = [own.map.double() for own in fitted]
+    totals = [
+        (own.T @ (one.within + one.between) @ own).trace().clamp(min=_TINY)
+        for own, one in zip(maps, scatters, strict=True)
+    ]
+    scaled = [own * (totals[0] / total).sqrt() for own, total in zip(maps, totals, strict=True)]
+    means, ratios = (torch.cat([getattr(own, part) for own in fitted]) for part in ("mean", "ratios"))
+    return Projection(means, torch.block_diag(*scaled).float(), ratios.sort(descending=True).values)
 
 
 class Whitening(nn.Module):

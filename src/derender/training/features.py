@@ -20,9 +20,10 @@ from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks import Factor
 from derender.postprocess import Features
+from derender.postprocess.embedding import HISTOGRAMS
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
 from derender.postprocess.morphable import MorphableMaps
-from derender.postprocess.whitening import Scatter, Whitening, fit_projection
+from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
 from derender.render import warp
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior, brightness_cues
@@ -101,14 +102,15 @@ def fit_whitening(
         raise ValueError("whitening needs at least 2 images, got 0")
     model = model.without_features().with_brightness(None)
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
+    gradients = settings.gradients and settings.spatial
+    described = {f.name for f in maps if gradients and f.parameter == "albedo"}
 
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-        gradients = {f.name: settings.gradients and f.parameter == "albedo" for f in maps}
-        return {name: model.factor_activations(name, batch, own) for name, own in gradients.items()}
+        return {f.name: model.factor_activations(f.name, batch, f.name in described) for f in maps}
 
     encode = activated if settings.spatial else model.encode
     names = tuple(factor.name for factor in maps)
-    mirrored: dict[str, Scatter] = {}
+    mirrored: dict[str, list[Scatter]] = {}
     alone: dict[str, Scatter] = {}
     with evaluating(model):
         for start, batch in _batches(model, images, rows, progress):
@@ -126,7 +128,10 @@ def fit_whitening(
                 )
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
-                mirrored.setdefault(name, Scatter()).add(joined)
+                blocks = joined.tensor_split([-HISTOGRAMS] if name in described else [], dim=-1)
+                own = mirrored.setdefault(name, [Scatter() for _ in blocks])
+                for scatter, block in zip(own, blocks, strict=True):
+                    scatter.add(block)
             exchangeable = len(batch) > 1 and settings.vectors
             for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
@@ -136,8 +141,8 @@ def fit_whitening(
     size = size or model.settings.network.code_size
     shrinkage, power = settings.shrinkage, settings.vector_power
     projections = {
-        name: fit_projection(scatter, settings.directions, shrinkage, size, settings.evenness)
-        for name, scatter in mirrored.items()
+        name: fit_side_by_side(own, settings.directions, shrinkage, size, settings.evenness)
+        for name, own in mirrored.items()
     } | {
         name: fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
         for name, scatter in alone.items()
