@@ -67,7 +67,7 @@ $(RESULTS)/robustness-cars.json: | $(STAMP)
 # Results on sets that come from their owners: lfw64.zip, utkface64.zip and celeba64.zip in IMAGES, aligned, 64 pixels.
 PUBLISHED := benchmarks/results/published
 LFW := --label identity --min-count 20 --max-count 20
-published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make published IMAGES=folder (an hour, resumable)
+published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make published IMAGES=folder (two hours, resumable)
 	@mkdir -p build; test -f build/lfw-fitted.parquet || $(BIN)/derender embed $(IMAGES)/lfw64.zip --model faces-64 \
 	  --fit-steps 60 --keep-duplicates --out build/lfw-fitted.parquet
 	@for step in "lfw evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW)" \
@@ -80,6 +80,7 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make publishe
 	  "races evaluate cluster $(IMAGES)/utkface64.zip --model faces-64 --limit 4000 --label race --resamples 200" \
 	  "celeba-labels evaluate linear $(IMAGES)/celeba64.zip --model faces-64 --attributes --heads linear,centred,logistic --resamples 200 --seeds 1" \
 	  "robustness-lfw evaluate robustness $(IMAGES)/lfw64.zip --model faces-64 --pictures render $(LFW)" \
+	  "compare-linear compare --table linear --model faces-64 $(IMAGES)/celeba64.zip --finetune --supervised --seeds 1 --untrained-seeds 1" \
 	  "compare-identity compare --table identity --model faces-64 $(IMAGES)/lfw64.zip" \
 	  "compare-emotion compare --table emotion --model faces-64 $(IMAGES)/lfw64.zip" \
 	  "compare-clustering compare --table clustering --model faces-64 $(IMAGES)/celeba64.zip" \

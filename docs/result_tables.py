@@ -4,6 +4,7 @@ A table is one of ``FILES``, each read by a function of its own, or a file of be
 its columns in it. There a row with ``hidden`` stays in the file.
 """
 
+import csv
 import json
 import re
 import textwrap
@@ -187,6 +188,30 @@ def beside_the_paper(_: Any) -> Iterator[list[str]]:
         yield [f"the paper: {method}", *(f"{part[method]:.3f}" for part in theirs)]
 
 
+def few_labels(result: Any) -> Iterator[list[str]]:
+    """Accuracy of the paper's head, frozen and fine-tuned, and the paper's own rows but StyleGAN2."""
+    columns = [(head, count) for count in (100, 1000) for head in ("linear", "fine-tuned")]
+    yield ["", *(f"{count:,} labels" + ", fine-tuned" * (head != "linear") for head, count in columns)]
+    parts = {(one["head"], one["labels"]): one["rows"] for one in result["parts"]["attributes"]["parts"]}
+    for name, row in parts["fine-tuned", 100].items():
+        found = {key: part.get(name) for key, part in parts.items()}
+        if not row["control"] or name == "untrained encoder":
+            shown = columns
+        else:  # controls without an encoder are not fine-tuned
+            shown = [key for key in columns if (key[0] == "linear") != (name.startswith("ResNet"))]
+        scores = (found[key] if key in shown else None for key in columns)
+        cells = ("" if one is None else f"{one['scores']['accuracy']['value']:.3f}" for one in scores)
+        yield [name + " (control)" * row["control"], *cells]
+    theirs: dict[str, dict[str, str]] = {}
+    with (RESULTS.parents[1] / "src" / "derender" / "evaluation" / "paper_tables.csv").open() as lines:
+        for line in csv.DictReader(lines):
+            if line["part"] == "linear" and line["method"] != "StyleGAN2":
+                theirs.setdefault(line["method"], {}).update({key: one for key, one in line.items() if one})
+    for method, own in theirs.items():
+        cells = (own.get(f"{head} {count}") for head, count in columns)
+        yield [f"the paper: {method}", *("" if one is None else f"{float(one):.3f}" for one in cells)]
+
+
 ROBUST = {
     "people": "generated/robustness-faces.json", "LFW": "published/robustness-lfw.json",
     "cars": "generated/robustness-cars.json",
@@ -351,6 +376,7 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files,
     "disentanglement-generated": ("true-factors.json", disentangled),
     "swap-matrix-generated": ("true-factors.json", swapped),
     "bench": ("bench.json", speed.shares),
+    "step-profile": ("step_profile.json", speed.profiled),
     "compiled-step": ("compiled_step.json", speed.compiled),
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "gpu-agreement": ("gpu.json", speed.gpu_agreement),
@@ -370,6 +396,7 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files,
     "celeba-labels": ("published/celeba-labels.json", probed),
     "robustness-generated": (" ".join(ROBUST.values()), turned_and_lit),
     "paper-clustering": (" ".join(f"published/compare-{one}.json" for one in PAPER), beside_the_paper),
+    "paper-linear": ("published/compare-linear.json", few_labels),
     "demo-depth": ("demo.json", part("geometry", {"SIDE x 100": 3, "MAD": 1})),
     "demo-people": ("demo.json", part("clustering", {"accuracy": 3, "NMI": 3})),
     "demo-images": ("demo.json", part("reconstruction", {"L1": 4, "PSNR": 2, "SSIM": 3})),

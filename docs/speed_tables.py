@@ -85,6 +85,19 @@ def compiled(result: Any) -> Iterator[list[str]]:
         yield [what, *times, f"{row['ratio']:.2f}", spread, f"{row['compiling_cpu_s']:.0f}"]
 
 
+def profiled(result: Any) -> Iterator[list[str]]:
+    yield ["", *(f"`{row['preset']}`, {row['size']} px" for row in result["rows"])]
+    first = result["rows"][0]["shares"]
+    for name in sorted(first, key=lambda name: -first[name]):
+        yield [name, *(f"{100 * row['shares'][name]:.0f} %" for row in result["rows"])]
+    yield ["GFLOP an image", *(f"{row['gflop_per_image']:.1f}" for row in result["rows"])]
+    yield ["GFLOP a CPU second, whole step", *(f"{row['gflop_per_cpu_s']:.0f}" for row in result["rows"])]
+    yield [
+        "the same, 2,048 x 2,048 matrix product",
+        *[f"{result['matrix_product']:.0f}"] * len(result["rows"]),
+    ]
+
+
 def fitting(result: Any) -> Iterator[list[str]]:
     yield [f"{result['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
     before = 1000 * result["fit"]["portions_of_4_s"] / result["images"]
