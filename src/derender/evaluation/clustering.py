@@ -49,6 +49,8 @@ from derender.evaluation.score_table import (
 )
 from derender.features import missing
 
+_DESCRIBED = ("identity", ["identity"], "class", ["class"])  # labels whose tables show descriptors, too
+
 
 def cluster(
     features: FeatureSource,
@@ -77,7 +79,7 @@ def cluster(
     Raises:
         ValueError: labels, factors or images do not fit.
     """
-    how = Options(**{"descriptors": label == "identity" or label == ["identity"], **options})
+    how = Options(**{"descriptors": label in _DESCRIBED, **options})
     rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
     ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)

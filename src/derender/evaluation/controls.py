@@ -1,8 +1,8 @@
 """Controls that every score of features stands beside, made of the same images under the same protocol.
 
 Without learning: an untrained encoder of the same architecture (several seeds), principal components and
-the pixels themselves. Identity tables also have descriptors, of the image alone and averaged with those of
-its mirror image: whitened features see both.
+the pixels themselves. Tables of identity and class also have descriptors, of the image alone and averaged
+with those of its mirror image: whitened features see both.
 """
 
 from collections.abc import Mapping, Sequence

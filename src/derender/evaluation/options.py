@@ -31,7 +31,7 @@ class Options:
         seed: the first seed of every random choice: resamples, subsets, k-means, untrained encoders.
         keep_duplicates: of identical images keep every one.
         descriptors: also compare with Gradientfaces, HOG and LBP, alone and with mirror images, as tables
-            of identity do.
+            of identity and class do.
         dataset, limit: how an address of images is read, see ``derender.inputs.as_images``.
         device: of models that are loaded here.
         cache: folder of cached results, "none" for none; by default the user's.

@@ -217,6 +217,7 @@ _PRESET_CHANGES: dict[str, dict[str, Any]] = {
     "cats": {},
     "cars": {
         "batch_size": 256,
+        "whitening": {"gradients": True},
         "objective": {
             "flip_weight": 1.0, "confidence": False, "perceptual_weight": 0.01, "smoothness_weight": 0.1,
         },
