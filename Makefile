@@ -33,12 +33,15 @@ release: $(STAMP)  ## licences and known advisories of every package, into build
 # stopped run goes on where it was. `make results RESULTS=folder` leaves the files of the repository alone.
 RESULTS := benchmarks/results/generated
 DATA := build/results
-SCORES := heads heads-fitted brightness people cars-clusters cars-geometry robustness-faces robustness-cars
+SCORES := heads heads-fitted heads-128 brightness people cars-clusters cars-geometry robustness-faces robustness-cars
 results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
 	@$(BIN)/python docs/pages.py
 
 $(DATA)/%: | $(STAMP)
 	@rm -rf $@.part; $(BIN)/derender synth $* --benchmark --out $@.part && mv $@.part $@
+
+$(DATA)/faces-128: | $(STAMP)
+	@rm -rf $@.part; $(BIN)/derender synth faces --benchmark --image-size 128 --out $@.part && mv $@.part $@
 
 HEADS := evaluate geometry $(DATA)/faces/test --model rendered-faces-64
 HEADS-FITTED := $(HEADS) --fit-steps 60
@@ -51,6 +54,8 @@ $(RESULTS)/heads.json: | $(DATA)/faces
 	$(SCORE) $(HEADS)
 $(RESULTS)/heads-fitted.json: | $(DATA)/faces
 	$(SCORE) $(HEADS-FITTED)
+$(RESULTS)/heads-128.json: | $(DATA)/faces-128
+	$(SCORE) evaluate geometry $(DATA)/faces-128/test --model rendered-faces-128
 $(RESULTS)/brightness.json: | $(DATA)/faces
 	$(SCORE) $(BRIGHTNESS)
 $(RESULTS)/people.json: | $(DATA)/faces

@@ -14,7 +14,7 @@ import derender
 from derender.data.synthetic import cars, faces
 
 FOLDER = Path(__file__).with_name("outputs")
-PICTURES = dict.fromkeys(("faces-64", "faces-128", "rendered-faces-64"), faces.generate)
+PICTURES = dict.fromkeys(("faces-64", "faces-128", "rendered-faces-64", "rendered-faces-128"), faces.generate)
 PICTURES["cars-64"] = cars.generate
 COUNT, SEED, STRIDE, FIT_STEPS = 3, 7, 4, 2
 ENCODED = {"rendered-faces-64": 192}  # columns of features before the coordinates of fitted scenes

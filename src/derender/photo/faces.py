@@ -37,7 +37,10 @@ UTKFACE: Template = ((0.303, 0.299), (0.697, 0.299), (0.5, 0.547), (0.322, 0.720
 RENDERED: Template = ((0.311, 0.283), (0.689, 0.283), (0.5, 0.508), (0.347, 0.731), (0.653, 0.731))
 """Medians over 292 images of UTKFace and 268 of the rendered training set, made symmetric."""
 
-TEMPLATES = {"faces-64": UTKFACE, "faces-128": UTKFACE, "rendered-faces-64": RENDERED}
+TEMPLATES = {
+    **dict.fromkeys(("faces-64", "faces-128"), UTKFACE),
+    **dict.fromkeys(("rendered-faces-64", "rendered-faces-128"), RENDERED),
+}
 POINTS = ("left_eye", "right_eye", "nose", "mouth_left", "mouth_right")
 
 

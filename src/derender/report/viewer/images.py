@@ -2,9 +2,10 @@
 
 Opened images are kept in memory only: a bounded number of them, and of bytes. Examples lie beside this file,
 eight in a row. portraits.webp, for ``faces-64``: heads that ``derender.data.synthetic`` made (seed 7).
-faces.png, for ``rendered-faces-64``: eight of the 800 images that it was tested on, evenly spaced; cars.png:
-eight of the 1,000 that ``cars-64`` was tested on, evenly by class (Kenney and Quaternius, CC0). Heads:
-geometry ICT-FaceKit, MIT; skins MakeHuman, CC0. They show no real person and no model saw them in training.
+faces.png and heads.webp, for ``rendered-faces-64`` and ``rendered-faces-128``: eight of 800 images that each
+was tested on, evenly spaced; cars.png: eight of the 1,000 that ``cars-64`` was tested on, evenly by class
+(Kenney and Quaternius, CC0). Heads of faces.png: geometry ICT-FaceKit, MIT; skins MakeHuman, CC0; the others
+are generated. They show no real person and no model saw them in training.
 Rows of a table are read from folders, zips and tables of paths in place. A stream (tar shards, Hugging Face)
 is read only from its beginning, so its images are not shown.
 """
@@ -37,6 +38,7 @@ KEPT_BYTES = 400_000_000
 ROWS = {
     **dict.fromkeys(("faces-64", "faces-128"), "portraits.webp"),
     "rendered-faces-64": "faces.png",
+    "rendered-faces-128": "heads.webp",
     "cars-64": "cars.png",
 }
 LABELS_SHOWN, THUMBNAIL = 4, 96
