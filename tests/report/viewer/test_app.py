@@ -16,7 +16,7 @@ from derender import Derenderer, load
 from derender.data.synthetic import faces
 from derender.report.viewer.app import Application
 from derender.report.viewer.images import rendered_examples
-from derender.report.viewer.questions import CropRequest, Light, Place, Refused, ViewRequest
+from derender.report.viewer.questions import Camera, CropRequest, Light, Place, Refused, ViewRequest
 from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 from derender.scene.crop import Crop
@@ -179,6 +179,7 @@ def test_too_much_work_is_refused_not_queued_for_ever(model, picture, client):
     with serving(application) as url:
         reply = type(client)(url).post("/api/view", asked)
         assert (reply.status, "too long" in reply.error) == (503, True)
+        assert type(client)(url).opened()  # fits scenes, and compiles at its first time: it may take longer
 
 
 def test_a_wider_picture_is_shown_in_the_part_that_the_model_knows():
@@ -261,3 +262,7 @@ def test_a_model_of_wider_ranges_than_the_page_has_opens_at_its_bounds():
     assert {abs(one) for one in result["camera"]["rotation_deg"]} == {89}
     assert studio.view(ViewRequest(**{name: result[name] for name in ("picture", "light", "camera")}))
     assert Light.of(torch.tensor([torch.nan, -1, 0, torch.nan])).ambient == 0
+    for one in (studio, Studio(load("faces-64"), "faces-64")):  # the ends of all sliders are accepted
+        about = one.about()
+        Camera(rotation_deg=[about["rotation_deg"]] * 3, translation=about["translation"])
+    assert Camera.of(torch.tensor([0, 0, 0, 0, 0, 0.77])).translation[2] == pytest.approx(0.77)

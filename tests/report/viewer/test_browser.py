@@ -230,7 +230,9 @@ def test_a_crop_is_moved_a_new_picture_resets_swaps_and_what_is_wrong_is_said(pa
         file = {"name": f"{number}.png", "mimeType": "image/png", "buffer": png(rendered[number])}
         page.set_input_files("#file-second", file)
         page.wait_for_selector(f'#second[alt="second photograph: {number}.png"]')
-    set_slider(page, "camera-yaw", 30)  # opens it again
+    with page.expect_request("**/api/crop") as cropped:
+        set_slider(page, "camera-yaw", 30)  # opens it again, in the crop that was chosen
+    assert cropped.value.post_data_json["crop"]["side"] == 292  # the middle of 392 x 292 pixels
     assert "no longer stored" not in page.inner_text("#status")
 
 

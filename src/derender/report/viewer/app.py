@@ -44,7 +44,7 @@ from derender.report.viewer.server import Guard
 from derender.report.viewer.studio import Studio
 
 LONG_WORK = 6
-"""Films and fits may take so many times as long as other answers."""
+"""Opening, which fits, and films may take so many times as long as other answers."""
 
 REQUEST_LIMIT_BYTES = 10_000
 
@@ -201,7 +201,7 @@ class Application:
         return Response(content, media_type=next(known, "video/mp4"))
 
     async def _opened(self, *images: Any) -> Response:
-        return JSONResponse(await self._work(self._computing, self.studio.open, *images))
+        return JSONResponse(await self._work(self._computing, self.studio.open, *images, patience=LONG_WORK))
 
     async def _work(
         self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any, patience: int = 1
@@ -214,7 +214,7 @@ class Application:
             job = asyncio.get_running_loop().run_in_executor(pool, function, *arguments)
             return await asyncio.wait_for(job, patience * self.work_seconds)
         except TimeoutError as late:
-            raise Refused(503, "this took too long: try again, or choose a smaller size") from late
+            raise Refused(503, "this took too long: try again, or with fewer --fit-steps") from late
         finally:
             self._waiting -= 1
 

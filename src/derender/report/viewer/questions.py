@@ -26,7 +26,7 @@ PIXEL_LIMIT = 40_000_000
 KINDS = "JPEG, PNG, WebP, AVIF, BMP, GIF, TIFF, PPM"
 
 ImageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{22}$")]
-STRONGEST, FARTHEST, STEEPEST_DEG = 2.0, 0.5, 89.0
+STRONGEST, FARTHEST, STEEPEST_DEG = 2.0, 2.0, 89.0
 Angle = Annotated[float, Field(ge=-STEEPEST_DEG, le=STEEPEST_DEG)]
 Strength = Annotated[float, Field(ge=0, le=STRONGEST)]
 Shift = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]

@@ -36,6 +36,8 @@ from derender.report.panel import labelled_grid
 from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
 from derender.report.viewer.images import Example, Gallery, Shelf, ShownImage, data_url
 from derender.report.viewer.questions import (
+    FARTHEST,
+    STEEPEST_DEG,
     Camera,
     CropRequest,
     FilmRequest,
@@ -82,6 +84,7 @@ class Studio:
     def about(self) -> dict[str, Any]:
         """The model's name and abilities, ranges of the camera, examples, table, bound of the shelf."""
         ranges, rows, table = self.model.settings.ranges, self.model.factors, None
+        reaches = (ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1))
         if self.gallery is not None:
             factors = [name for name in self.gallery.table.factors if name in self.model.nets]
             note = self.gallery.without_pictures
@@ -97,8 +100,8 @@ class Studio:
             "light": any(row.parameter == "light" for row in rows),
             "numbers": {row.name: [asdict(one) for one in row.numbers] for row in rows if row.numbers},
             "maps": list(self.model.renderer.maps),
-            "rotation_deg": ranges.rotation_deg,
-            "translation": [ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1)],
+            "rotation_deg": min(ranges.rotation_deg, STEEPEST_DEG),
+            "translation": [min(reach, FARTHEST) for reach in reaches],
             "kept": self.shelf.limit,
         }
 

@@ -72,7 +72,7 @@ async function askAbout(path, more = {}) {
     for (const one of [first, second]) {
       if (!one) continue;
       one.picture = (await (await request(one.source)).json()).picture;
-      if (one.framed === "own" || one.fit !== about.fits) one.picture = (await cropped(one, one.framed === "own" ? one.crop : null, one.fit)).picture;
+      if (one.asked) one.picture = (await cropped(one, one.crop, one.fit)).picture;
     }
     return ask(path, question(more));
   }
@@ -335,6 +335,7 @@ function tell() {
 }
 
 const recrop = newest(async () => {
+  if (!first.asked) return; // another photograph came meanwhile
   const { crop, fit } = first.asked;
   say(fit ? "Fitting to the photograph." : "Reading the crop.");
   try {
