@@ -37,7 +37,6 @@ from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
 from derender.report.viewer.images import Example, Gallery, Shelf, ShownImage, data_url
 from derender.report.viewer.questions import (
     FARTHEST,
-    STEEPEST_DEG,
     Camera,
     CropRequest,
     FilmRequest,
@@ -100,7 +99,7 @@ class Studio:
             "light": any(row.parameter == "light" for row in rows),
             "numbers": {row.name: [asdict(one) for one in row.numbers] for row in rows if row.numbers},
             "maps": list(self.model.renderer.maps),
-            "rotation_deg": min(ranges.rotation_deg, STEEPEST_DEG),
+            "rotation_deg": ranges.rotation_deg,
             "translation": [min(reach, FARTHEST) for reach in reaches],
             "kept": self.shelf.limit,
         }
@@ -245,9 +244,8 @@ class Studio:
         """Input, its reconstruction, and the factors of the requested view, by name."""
         opened, size = self.shelf.get(question.picture), self._size(question)
         with torch.inference_mode():
-            factors = factor_images(
-                at_size(self.scene(question), size), self.model.renderer, self.model.fov_deg
-            )
+            scene = at_size(self.scene(question), size)
+            factors = factor_images(scene, self.model.renderer, self.model.fov_deg)
             return {
                 "input": colours.pictures(opened.pixels[None])[0],
                 "reconstruction": self._rendered(at_size(opened.scene, size)),
