@@ -13,6 +13,7 @@ from derender.evaluation.finetuning import FinetuneTask, load_finetuned, score_f
 from derender.evaluation.memory import Memory
 from derender.evaluation.score_table import Scores
 from derender.inputs import as_images, as_model, device_named
+from derender.storage.bounded import parse_json, read_text
 from derender.training import derender_task
 from derender.training.config import PRESETS, FinetuneConfig, TrainConfig, as_overrides, resolve, with_changes
 from derender.training.distributed import leave, open_fabric, this_rank_writes
@@ -104,13 +105,19 @@ def train(
         raise ValueError(f"config holds all settings already: leave out {', '.join(choices)}")
     if resume and not (out / "config.yaml").is_file():
         raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): train without resume first")
-    accelerator = device_named(device)
-    fabric = open_fabric(accelerator)
+    fabric = open_fabric(accelerator := device_named(device))
     if this_rank_writes() and not resume:
         refuse_taken(out)
     with fabric.rank_zero_first(local=True):
         reading = Progress.of("reading", report)
         images = as_images(images, image_size_of(config), dataset=dataset, limit=limit, progress=reading)
+    if resume and (file := out / "environment.json").is_file():
+        began = parse_json(read_text(file), dict[str, Any]).get("data", {})
+        if began and (began.get("layout"), began.get("pictures")) != (images.layout, len(images)):
+            raise ValueError(
+                f"{out} was trained on {began.get('pictures')} images ({began.get('layout')}), not on these "
+                f"{len(images)} ({images.layout}): resume with the same, or start a new run with --start-from"
+            )
     if on_images is not None:
         on_images(images)
     ours = isinstance(config, TrainConfig)
@@ -157,9 +164,7 @@ def finetune_settings(
     names = locals()
     if resume:
         if not (Path(out) / "config.yaml").is_file():
-            raise FileNotFoundError(
-                f"no run to resume in {out} (no config.yaml): run it without resume first"
-            )
+            raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): begin without resume")
         config = read_any_config(Path(out))
         if not isinstance(config, FinetuneConfig):
             raise ValueError(f"{out} was made by derender train: continue with derender train --resume")
