@@ -280,3 +280,12 @@ def test_a_feature_table_in_another_format_is_refused(refused, tmp_path):
     out = tmp_path / "features.csv"
     assert "parquet" in refused("embed", tmp_path, "--model", "faces-64", "--out", out)
     assert not out.exists()
+
+
+def test_a_shell_is_given_completions(monkeypatch, capsys):
+    words = {"_DERENDER_COMPLETE": "complete_bash", "COMP_WORDS": "derender dem", "COMP_CWORD": "1"}
+    for name, value in words.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit):
+        main([])
+    assert capsys.readouterr().out.split() == ["demo"]
