@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,13 @@ def test_decompose_gives_a_scene_in_range(model, images):
     assert scene.light[:, 2:].abs().max() <= math.pi / 4
     assert scene.camera[:, :3].abs().max() <= math.pi / 3
     assert (scene.camera[:, 5] == 0).all()
+
+
+def test_half_precision_images_and_pickled_models_give_the_scene(model, images):
+    expected = model.decompose(images.half().float()).depth
+    assert torch.equal(model.decompose(images.half()).depth, expected)
+    assert torch.equal(pickle.loads(pickle.dumps(model)).decompose(images.half()).depth, expected)
+    assert model.decompose(images.bfloat16()).depth.dtype == torch.float32
 
 
 def test_render_of_decompose_is_reconstruct(model, images):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import torch
 from jaxtyping import Float
@@ -147,28 +147,28 @@ def _radians(angle_deg: float) -> float:
 
 def map_net(channels: int, initial_scale: float = 1.0) -> Callable[[NetworkSettings], FactorNet]:
     """Builder of a network for an image-sized map, whose last layer's first weights are scaled."""
+    return partial(_map_net, channels, initial_scale)  # a local function could not be pickled
 
-    def build(settings: NetworkSettings) -> FactorNet:
-        if settings.encoder == "unet":
-            encoder = UNetEncoder(settings, settings.code_size)
-        else:
-            encoder = Encoder(settings, settings.width, settings.code_size, normalised=True)
-        decoder = MapDecoder(settings, channels)
-        with torch.no_grad():
-            decoder.last.weight.mul_(initial_scale)
-        return FactorNet(encoder, decoder)
 
-    return build
+def _map_net(channels: int, initial_scale: float, settings: NetworkSettings) -> FactorNet:
+    if settings.encoder == "unet":
+        encoder = UNetEncoder(settings, settings.code_size)
+    else:
+        encoder = Encoder(settings, settings.width, settings.code_size, normalised=True)
+    decoder = MapDecoder(settings, channels)
+    with torch.no_grad():
+        decoder.last.weight.mul_(initial_scale)
+    return FactorNet(encoder, decoder)
 
 
 def vector_net(numbers: int) -> Callable[[NetworkSettings], FactorNet]:
     """Builder of a network that predicts a few numbers in -1..1."""
+    return partial(_vector_net, numbers)
 
-    def build(settings: NetworkSettings) -> FactorNet:
-        encoder = Encoder(settings, settings.light_width, settings.code_size, normalised=False)
-        return FactorNet(encoder, VectorDecoder(settings.code_size, numbers))
 
-    return build
+def _vector_net(numbers: int, settings: NetworkSettings) -> FactorNet:
+    encoder = Encoder(settings, settings.light_width, settings.code_size, normalised=False)
+    return FactorNet(encoder, VectorDecoder(settings.code_size, numbers))
 
 
 GEOMETRY_START = 0.1
