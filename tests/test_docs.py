@@ -220,6 +220,9 @@ def test_python_blocks_compile(path):
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "derender":
                 assert follow(f"derender.{node.attr}"), node.attr
+            if isinstance(node, ast.Call) and re.match(r"(derender\.)?evaluate\.", ast.unparse(node.func)):
+                called = getattr(importlib.import_module("derender.evaluation"), node.func.attr)
+                inspect.signature(called).bind(*node.args, **{word.arg: word.value for word in node.keywords})
 
 
 def test_conventions_name_their_tests():
