@@ -63,6 +63,8 @@ def test_optimisation_per_image_needs_its_maps(model):
     with pytest.raises(ValueError, match="derender whiten"):
         as_model(model, fit_steps=3)
     assert as_model(model, fit_steps=0).fitting is None
+    with pytest.raises(ValueError, match="fit_steps must be 0 or more, got -1"):
+        as_model("faces-64", fit_steps=-1)
 
 
 def test_devices():

@@ -190,6 +190,8 @@ def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, 
     kept = (out / "1" / "strip.png").stat().st_mtime_ns
     told, printed = numbers(*words, "--resume")
     assert [Path(one["folder"]).name for one in told["pictures"]] == ["3"] and "5 done before" in printed
+    told, printed = numbers(*words, "--resume")
+    assert told["pictures"] == [] and "left out" in printed and "6 done before" in printed
     assert (out / "1" / "strip.png").stat().st_mtime_ns == kept
 
 

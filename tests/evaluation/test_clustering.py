@@ -146,6 +146,7 @@ def test_missing_labels_are_dropped_and_counted():
         ({"who": np.zeros(90)}, {}, "two classes, the 90 labelled rows of 'who' have 1"),
         ({"who": np.full(90, "")}, {}, "two classes, the 0 labelled rows of 'who' have 0"),
         ({"who": np.arange(90) % 2}, {"n_clusters": 91}, "cannot make 91 clusters of 90 rows"),
+        ({"who": np.arange(90) % 2}, {"n_clusters": 0}, "cannot make 0 clusters of 90 rows"),
         ({"who": np.arange(89) % 2}, {}, "features 'ours' have 90 rows, the labels 89"),
         ({"who": np.arange(90)}, {}, "is a class of its own"),
         ({}, {}, "at least one label"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from derender.evaluation.feature_rows import FeatureRow, prepare
+from derender.evaluation.options import Options
 from derender.features import FeatureTable
 
 WHO = np.array(["ann", "ann", "bob", "bob", "bob", ""])
@@ -38,6 +39,10 @@ def test_tracks_are_averaged_in_every_row_by_the_first_rows_labels():
     np.testing.assert_allclose(ready.features["other"][0], expected, rtol=1e-6)
     with pytest.raises(ValueError, match="label 'track' differs inside groups of who: average by it too"):
         prepare([row("ours", table())], ("track",), mean_by=("who",))
+
+
+def test_one_factor_may_be_a_name_alone():
+    assert Options(factors="geometry").chosen == ("geometry",)
 
 
 def test_classes_are_chosen_by_size():

@@ -181,6 +181,7 @@ def test_select_takes_slices_indices_and_masks():
         assert part.label("who").tolist() == ["b", "c", "d"]
         np.testing.assert_array_equal(part.factors["albedo"], table.factors["albedo"][1:4])
     assert table.select([4, 0]).files == ("4.jpg", "0.jpg")
+    assert table.select([]).files == ()
 
 
 def test_mean_by_averages_groups_and_keeps_what_is_constant():

@@ -86,6 +86,7 @@ def test_it_works_in_a_pipeline_under_grid_search_with_names_and_pandas(model, p
         (lambda images: np.full((1, 3, 8, 8), np.nan), "holds values that are not finite"),
         (lambda images: "one.png", "got the one path 'one.png': give a list of paths"),
         (lambda images: [None, None], "expected paths of images, got NoneType"),
+        (lambda images: np.array([["a.png", "b.png"]]), r"one path for each image, got shape \(1, 2\)"),
     ],
 )
 def test_wrong_images_are_refused_in_words(model, pictures, change, message):

@@ -88,6 +88,8 @@ def test_every_kind_of_image_comes_back_as_it_came(photo, model, tmp_path):
     tensor = derender.relight(torch.from_numpy(pixels.transpose(2, 0, 1).copy()).float() / 255, model)
     assert tensor.shape == (3, *pixels.shape[:2])
     assert (tensor * 255 - torch.from_numpy(wanted.transpose(2, 0, 1).copy())).abs().max() < 1e-3
+    coarse = derender.relight(torch.from_numpy(pixels / 255).bfloat16(), model)
+    assert coarse.shape == pixels.shape and coarse.dtype == torch.bfloat16
     listed = derender.relight([photo, pixels], model)
     assert isinstance(listed[0], Image.Image) and (listed[1] == wanted).all()
 
@@ -98,6 +100,7 @@ def test_every_kind_of_image_comes_back_as_it_came(photo, model, tmp_path):
         (np.full((80, 80, 3), 200.0), "divide by 255"),
         (np.full((80, 80, 3), -0.5), "add 1 and halve"),
         (np.zeros((80, 80, 4)), r"\(80, 80, 4\) is no image"),
+        (np.zeros((0, 80, 80, 3)), r"\(0, 80, 80, 3\) is no image"),
         (np.zeros((80, 80, 3), np.int64), "int64"),
         (np.full((80, 80, 3), np.nan), "not finite"),
         ("no/such/file.jpg", "does not exist"),

@@ -280,7 +280,7 @@ def as_batch(
     ):
         check_images(images, size)
         refuse_values(images)
-        return images if images.dtype in (torch.float32, torch.bfloat16, torch.float16) else images.float()
+        return images.float()
     squares = [fit_square(Image.fromarray(photo), size, "crop") for photo in as_photos(images)]
     stacked = np.stack([np.asarray(square) for square in squares])
     return torch.from_numpy(stacked).permute(0, 3, 1, 2).to(device).float() / 255
@@ -293,7 +293,7 @@ def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:
     if isinstance(images, Image.Image):
         return [np.array(upright_rgb(images))]
     if isinstance(images, Tensor):
-        images = images.detach().cpu().numpy()
+        images = (images.float() if images.dtype == torch.bfloat16 else images).detach().cpu().numpy()
     if not isinstance(images, np.ndarray):
         if not isinstance(images, Sequence) or not images:
             raise TypeError(
@@ -305,7 +305,7 @@ def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:
     batch = batch[None] if batch.ndim == 3 else batch
     if batch.ndim == 4 and batch.shape[-1] != 3:
         batch = batch.transpose(0, 2, 3, 1)
-    if batch.ndim != 4 or batch.shape[-1] != 3:
+    if batch.ndim != 4 or batch.shape[-1] != 3 or not batch.size:
         raise ValueError(
             f"an array of shape {shape} is no image: give (H, W, 3), (3, H, W), or a batch of either"
         )
@@ -338,7 +338,7 @@ def refuse_values(images: Tensor | np.ndarray) -> None:
     if isinstance(images, Tensor):
         if images.device.type != "cpu" or torch.compiler.is_compiling():
             return
-        images = images.detach().numpy()
+        images = images.detach().float().numpy()
     if images.size == 0:
         return
     low, high = float(images.min()), float(images.max())

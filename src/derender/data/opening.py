@@ -252,6 +252,11 @@ def open_source(path: Path) -> Source:
 
 def parse_source(source: str | Path) -> tuple[str, str | None, dict[str, str]]:
     """Place, part and options of ``PLACE?column=NAME::PART``; a path that exists as written is all place."""
+    if not isinstance(source, str | Path):
+        raise TypeError(
+            f"expected a folder, zip, shards or Hugging Face id, got {type(source).__name__}: "
+            "arrays and Pillow images go to model.embed or model.decompose"
+        )
     text = str(source)
     if Path(text).expanduser().exists():
         return text, None, {}

@@ -159,7 +159,7 @@ def compare_clusterings(
     labelled = ~np.all([missing(values) for values in columns.values()], axis=0)
     numbers = {name: _numbered(values[labelled], name) for name, values in columns.items()}
     sizes = {name: int(values.max()) + 1 for name, values in numbers.items()}
-    clusters = {name: n_clusters or size for name, size in sizes.items()}
+    clusters = {name: size if n_clusters is None else n_clusters for name, size in sizes.items()}
     n_rows, once = int(labelled.sum()), np.ones((1, labelled.sum()), np.float32)
 
     runs, starts = {}, range(seed, seed + (5 if method == "k-means" else 1))

@@ -62,7 +62,8 @@ class Options:
     @property
     def chosen(self) -> tuple[str, ...] | None:
         """``factors`` as a tuple."""
-        return None if self.factors is None else tuple(self.factors)
+        factors = (self.factors,) if isinstance(self.factors, str) else self.factors
+        return None if factors is None else tuple(factors)
 
     def seeds(self, count: int) -> tuple[int, ...]:
         """So many seeds, from ``seed`` on."""

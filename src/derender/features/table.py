@@ -87,6 +87,7 @@ class FeatureTable:
 
     def select(self, rows: Any) -> "FeatureTable":
         """The rows given by a slice, a list of indices or a bool mask."""
+        rows = rows if isinstance(rows, slice) or np.size(rows) else slice(0)
         chosen = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)].reshape(-1)
         return type(self)(
             tuple(self.files[row] for row in chosen),

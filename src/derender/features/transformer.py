@@ -87,6 +87,8 @@ def as_pixels(X: Any, image_size: int) -> np.ndarray:
         raise ValueError(f"expected several images, got the one path {str(X)!r}: give a list of paths")
     array = X.detach().cpu().numpy() if isinstance(X, torch.Tensor) else np.asarray(X)
     if array.size and array.dtype.kind in "UO":
+        if array.size != len(array):
+            raise ValueError(f"expected one path for each image, got shape {array.shape}: give one column")
         paths = array.reshape(-1).tolist()
         for item in paths:
             if not isinstance(item, (str, os.PathLike)):

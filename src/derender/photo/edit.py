@@ -263,8 +263,8 @@ def _each(image: GivenImages, edit: Callable[[np.ndarray], np.ndarray]) -> Any:
         return [_each(one, edit) for one in image]
     edited = [edit(photo) for photo in as_photos(image)]
     if isinstance(image, Tensor):
-        stacked = torch.from_numpy(_like(image.detach().cpu().numpy(), edited))
-        return stacked.to(image.device)
+        like = torch.from_numpy(_like(np.empty(image.shape, np.uint8), edited)).to(image.device)
+        return (like.double() / 255).to(image.dtype) if image.is_floating_point() else like
     if isinstance(image, np.ndarray):
         return _like(image, edited)
     return Image.fromarray(edited[0])

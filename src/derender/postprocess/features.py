@@ -55,6 +55,8 @@ class Features:
 
     def with_steps(self, steps: int) -> "Features":
         """The same with so many steps of fitting per image; 0: features are feed-forward only."""
+        if steps < 0:
+            raise ValueError(f"fit_steps must be 0 or more, got {steps}")
         return replace(self, fitting=None if self.fitting is None else self.fitting.with_steps(steps))
 
     def tensors(self) -> dict[str, Tensor]:

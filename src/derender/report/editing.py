@@ -137,7 +137,7 @@ def write_images(
     if moving and video is None:
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
     images_only = [file for file in files if file not in moving]
-    read, refused = readable(images_only, opener.read, progress, needed=not moving)
+    read, refused = readable(images_only, opener.read, progress, needed=not moving and not done)
     shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
     shown = {file: row for file, row in shown.items() if not is_video(file)}
     with_sheet = len(shown) > 1 if sheet is None else sheet
@@ -169,7 +169,7 @@ def write_images(
             refused[str(path)] = " ".join(str(problem).split())
         else:
             records.append(record)
-    if refused and not records:
+    if refused and not records and not done:
         raise ValueError(next(iter(refused.values())))
     rows = [(file.name, _row(row)) for file, row in shown.items()] if with_sheet else []
     rows = [row for row in rows if row[1]]
