@@ -9,6 +9,8 @@ import pytest
 from PIL import Image
 from tests.cli.conftest import run
 
+import derender
+from derender.data import read_images
 from derender.features import FeatureTable
 from derender.interpretation import load_probe, question
 from derender.interpretation.explanation import split_rows
@@ -91,6 +93,14 @@ def test_bad_words(tiny, data, why, tmp_path, refused):
         Image.fromarray(np.full((SIZE, SIZE, 3), place * 9, np.uint8)).save(tmp_path / f"{place}.png")
     told = refused("explain", "-m", tiny, "-d", tmp_path, "-l", "class")
     assert "has no labels, and an explanation needs" in told
+
+
+def test_yes_no_labels_with_one_answer_are_left_out_and_named(tiny, data):
+    images = read_images(data, SIZE)
+    bright = (images.labels["class"] == "bright").astype(np.int8)
+    images = replace(images, labels={"bright": bright, "never": 0 * bright})
+    results = derender.explain(images, tiny, seeds=1)
+    assert results.task.names == ("bright",) and results.scores.notes[-1].endswith("answers: never")
 
 
 def test_pictures_that_are_all_their_owners_test_part_are_split_here():

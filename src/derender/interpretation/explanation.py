@@ -47,6 +47,7 @@ class Explained:
 
     ``shares`` are of each factor in every answer. ``clusters`` and ``pair`` (two file names and parts) are
     there if requested. ``checks``, how maps answer to fresh weights, are filled when maps are drawn.
+    ``left_out`` are notes on yes/no labels with too few images of one answer.
     """
 
     shares: Explanation
@@ -57,6 +58,7 @@ class Explained:
     clusters: ClusterShares | None = None
     pair: tuple[tuple[str, str], PairParts] | None = None
     checks: Sequence[Similarity] = ()
+    left_out: Sequence[str] = ()
 
     @property
     def scores(self) -> Scores:
@@ -69,7 +71,7 @@ class Explained:
         stuck = (f"not to be trusted, fresh weights give the same map: {name}" for name in same)
         values = {"source": self.images.source, "sanity": self.checks, "clusters": self.clusters}
         values |= {**self.shares.numbers(), "pair": None if self.pair is None else self.pair[1]}
-        return Scores(shown, values, [*tables.share_verdicts(self.shares), *stuck])
+        return Scores(shown, values, [*tables.share_verdicts(self.shares), *stuck, *self.left_out])
 
 
 def explain(
@@ -127,8 +129,9 @@ def explain(
             raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
     table = embed_image_set(net, images, batch_size=batch_size, progress=progress("embedding"))
     names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels))
+    left_out: list[str] = []
     if not names:
-        names, _ = chosen_labels(table, None, True, least=0)
+        names, left_out = chosen_labels(table, None, True, least=max(min_count, 1))
     task = question(table.labels, names, bins=bins, min_count=min_count, source=images.source)
     own = range(seed, seed + seeds)
     split = split_rows(task, table, count, own, groups)
@@ -146,7 +149,7 @@ def explain(
         apart = cluster_shares(table.factors, made, seed=seed)
     if pair is not None:
         alike = pair, pair_parts(table.factors, *map(images.files.index, pair), seed=seed)
-    return Explained(shares, net, images, task, split, apart, alike)
+    return Explained(shares, net, images, task, split, apart, alike, left_out=left_out)
 
 
 def split_rows(
