@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from tests.cli.conftest import noise, settings
 from tests.cli.conftest import run as call
 
@@ -69,6 +70,22 @@ def test_controls_need_no_model(name, size, faces, run, tmp_path):
     assert call(*part) == 0
     test = FeatureTable.read(tmp_path / "part.parquet")
     assert len(test) == 2 and (name != "pca" or test.origin["fitted_on"] == 19)
+
+
+def test_controls_keep_copies_where_asked_and_name_unreadable_files(tmp_path, capsys, refused):
+    folder, out = tmp_path / "images", tmp_path / "table.parquet"
+    folder.mkdir()
+    for name, tone in {"a": 10, "b": 90, "c": 90}.items():
+        Image.new("RGB", (32, 32), (tone, 0, 0)).save(folder / f"{name}.png")
+    (folder / "bad.png").write_bytes(b"no image")
+    embed = ["embed", "--baseline", "pixels", "-d", folder, "--out", out]
+    assert call(*embed) == 0
+    printed = capsys.readouterr().err
+    assert "1 skipped, 1 identical copies dropped" in printed and "skipped bad.png: not an" in printed
+    assert call(*embed, "--keep-duplicates", "--force") == 0
+    assert len(FeatureTable.read(out)) == 3 and "1 identical copies kept" in capsys.readouterr().err
+    assert "leave it out" in refused(*embed, "--force", "--engine", "ray")
+    assert "--fit-steps belongs to our models" in refused(*embed, "--force", "--fit-steps", 2)
 
 
 def test_resnet18_trains_on_labels_and_embeds(faces, tmp_path, refused):

@@ -95,21 +95,27 @@ def embed_baseline(
 
     Arguments are ``open_baseline``'s, and for networks those of `derender.embed_to_file`. ``components`` is
     the number of dimensions of pca and noise. ``reading`` is how an address of images is read: ``dataset``,
-    ``part``, ``limit``.
+    ``part``, ``limit``, ``keep_duplicates``.
     """
     from derender.baselines.controls import control_features
-    from derender.features import Embedded, embed_to_file
+    from derender.features.embedding import LISTED_SKIPPED, Embedded, embed_to_file
+    from derender.inputs import as_images
 
-    reading = reading or {}
+    reading = dict(reading or {})
     if name not in CONTROLS:
         net = open_baseline(name, source, device=device, features=features, image_size=image_size, seed=seed)
         origin = {"source": source, "baseline": name}
         return embed_to_file(images, net, out, **reading, origin=origin, progress=progress, **how)
+    if how.get("engine") == "ray":
+        raise ValueError(f"engine 'ray' is for networks, and {name} has none: leave it out")
+    part = reading.pop("part", "all")
+    images = as_images(images, image_size or 64, **reading)
     table = control_features(
-        name, images, **reading, model=source, image_size=image_size or 64, components=components, seed=seed,
-        progress=progress,
-    )  # fmt: skip
+        name, images, part=part, model=source, components=components, seed=seed, progress=progress
+    )
     table.write(out)
     widths, origin = {name: table.factors[name].shape[1]}, dict(table.origin)
     facts = origin["data"], origin["layout"]
-    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, 0, (), 0, 0, *facts)
+    counts = len(images.skipped), images.skipped[:LISTED_SKIPPED], len(images.duplicates), 0
+    kept = reading.get("keep_duplicates", False)
+    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, *counts, *facts, kept)

@@ -47,19 +47,21 @@ def embed(
     name = baselines.baseline
     if name is None and model is None:
         raise ValueError("give --model RUN, or --baseline NAME (see derender embed --help)")
+    if name is not None and fit_steps is not None:
+        raise ValueError("--fit-steps belongs to our models: leave it out with --baseline")
     if engine == "local" and workers is not None:
         raise ValueError("--workers belongs to --engine ray: leave it out, every core is used")
     how = {"batch_size": batch_size, "engine": engine, "workers": workers, "fresh": output.force}
     with progress_bar("embedding") as report:
         how |= {"device": device, "progress": report}
+        reading = {**images.how, "keep_duplicates": keep_duplicates}
         if name is None:
-            how |= {**images.how, "fit_steps": fit_steps, "keep_duplicates": keep_duplicates}
-            done = derender.embed_to_file(images.address, model, out, **how)
+            done = derender.embed_to_file(images.address, model, out, **reading, fit_steps=fit_steps, **how)
         else:
             how["features"] = baselines.features and [part.strip() for part in baselines.features.split(",")]
             how |= {option: getattr(baselines, option) for option in ("image_size", "components", "seed")}
             call = derender.baselines.embed_baseline
-            done = call(name, images.address, out, model, reading=images.how, **how)
+            done = call(name, images.address, out, model, reading=reading, **how)
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
     notice("\n".join([done.describe(), *named]))
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())

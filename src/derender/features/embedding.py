@@ -49,7 +49,7 @@ class Embedded:
     """A feature table that was written: its rows, sizes of the factors, names of the labels, and origin.
 
     ``skipped`` images could not be read (``examples`` has the first), ``copies`` were identical to an earlier
-    one, ``resumed`` rows were made by an earlier run.
+    one (``kept`` in the table or not), ``resumed`` rows were made by an earlier run.
     """
 
     path: Path
@@ -63,6 +63,7 @@ class Embedded:
     resumed: int
     source: str
     layout: str
+    kept: bool = False
 
     def describe(self) -> str:
         """One line: how many images of which data set, how many were left out or had been there."""
@@ -70,7 +71,8 @@ class Embedded:
         parts = [f"{self.rows:,} {images} from {self.source} ({self.layout})"]
         parts += [f"{self.resumed:,} of them from the run before"] if self.resumed else []
         parts += [f"{self.skipped:,} skipped"] if self.skipped else []
-        parts += [f"{self.copies:,} identical copies dropped"] if self.copies else []
+        verb = "kept" if self.kept else "dropped"
+        parts += [f"{self.copies:,} identical copies {verb}"] if self.copies else []
         return ", ".join(parts)
 
 
@@ -155,7 +157,7 @@ def embed_to_file(
         else:
             blocks = local_blocks(net, images, start, workers=workers, **options)
         _compute(parts, blocks, keep_duplicates, getattr(images, "limit", None), progress)
-        return _finish(parts, path, images, facts, resumed)
+        return _finish(parts, path, images, facts, resumed, keep_duplicates)
 
 
 def unlike_training(images: ImageSet | str | Path, model: Any, **how: Any) -> str:
@@ -233,7 +235,7 @@ def _compute(
 
 
 def _finish(
-    parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int
+    parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int, kept: bool
 ) -> Embedded:
     """Put the parts together, then delete them."""
     skipped = (*(images.passed_over if isinstance(images, Stream) else ()), *parts.skipped)
@@ -249,5 +251,5 @@ def _finish(
     widths = {name: values.shape[1] for name, values in first.factors.items()}
     counts = (len(skipped), skipped[:LISTED_SKIPPED], parts.copies, resumed)
     return Embedded(
-        path, parts.rows, widths, tuple(first.labels), facts, *counts, images.source, images.layout
+        path, parts.rows, widths, tuple(first.labels), facts, *counts, images.source, images.layout, kept
     )
