@@ -1,5 +1,8 @@
 """Arguments of library calls: values pass through, names and addresses are resolved, mistakes are errors."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -71,3 +74,16 @@ def test_devices():
     assert device_named("cpu") == "cpu"
     with pytest.raises(ValueError, match="choose auto, cpu or cuda"):
         device_named("gpu")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("derender.embed(pixels)", "expected a folder, zip, shards or Hugging Face id, got ndarray"),
+        ("derender.photo.find_faces(pixels)", "expected bytes (H, W, 3), got float64"),
+    ],
+)
+def test_arrays_in_the_wrong_place_are_named_where_types_are_not_checked(call, message):
+    code = f"import derender, numpy; pixels = numpy.zeros((8, 8, 3)); {call}"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert message in answer.stderr.splitlines()[-1]

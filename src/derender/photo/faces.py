@@ -89,6 +89,8 @@ def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
     candidate is cut out upright and searched for again, at three sizes and in both directions: their mean is
     free of roll and of the detector's shift to one side.
     """
+    if photo.dtype != np.uint8 or photo.ndim != 3:
+        raise ValueError(f"expected bytes (H, W, 3), got {photo.dtype} of shape {photo.shape}: convert them")
     height, width = photo.shape[:2]
     scale = max(1.0, max(height, width) / LARGEST_SIDE)
     small = photo

@@ -73,9 +73,10 @@ class Shareable:
         reached.
         """
         beside = texts_beside(self.source, self.tensors())
-        if not (card or (data and licence) or CARD_FILE in beside):
+        own = CARD_FILE in beside and not (data or licence or scores)  # part of one would drop the licence
+        if not (card or (data and licence) or own):
             raise ValueError(
-                "this model has no card: state what it was trained on and what it may be used for, "
+                "a card needs both: state what it was trained on and what it may be used for, "
                 "push_to_hub(..., data=..., licence=...), or pass card="
             )
         card = card or self._card(beside, repository, data, licence, scores)
