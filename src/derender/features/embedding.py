@@ -49,7 +49,7 @@ class Embedded:
     """A feature table that was written: its rows, sizes of the factors, names of the labels, and origin.
 
     ``skipped`` images could not be read (``examples`` has the first), ``copies`` were identical to an earlier
-    one (``kept`` in the table or not), ``resumed`` rows were made by an earlier run.
+    one, ``resumed`` rows were made by an earlier run. ``kept``: the copies are in the table.
     """
 
     path: Path
