@@ -21,10 +21,10 @@ BUDGET = {  # lines, files
     "report": (4_040, 25),
     "cli": (2_300, 32),
     "training": (3_515, 17),  # CUDA graphs
-    "baselines": (2_470, 11),
+    "baselines": (2_480, 11),
     "render": (1_690, 15),
     "features": (1_380, 8),
-    "interpretation": (1_080, 5),
+    "interpretation": (1_085, 5),
     "photo": (1_500, 7),  # new light falls on the object alone
     "networks": (710, 5),
     "storage": (940, 8),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (660, 8),
     "learn": (940, 5),
 }
-TOTAL = (39_630, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_680
+TOTAL = (39_680, 248)  # on the way to (37_000, 270)
+TEST_LINES = 25_720
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}
