@@ -96,7 +96,7 @@ def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_
     assert main([str(word) for word in [*clustered, "--method", "finch"]]) == 0
     shown = capsys.readouterr()
     assert "FINCH on geometry + albedo: partitions found, 4 classes" in " ".join(shown.out.split())
-    assert "5 results computed, 8 found" in shown.err  # embeddings and PCA, and the levels' own trees
+    assert "11 results computed, 14 found" in shown.err  # embeddings and PCA, and the levels' own trees
 
 
 def test_the_papers_linear_table_frozen_and_fine_tuned(smiling, model, tmp_path, capsys, refused, numbers):
