@@ -17,7 +17,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (7_440, 32),
-    "evaluation": (7_620, 38),  # public functions name their errors
+    "evaluation": (7_625, 38),  # public functions name their errors
     "report": (4_040, 25),
     "cli": (2_300, 32),
     "training": (3_515, 17),  # CUDA graphs

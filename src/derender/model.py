@@ -156,7 +156,7 @@ def load(
 
     Args:
         source: a run folder, a saved folder, the name of a bundled model, or a Hugging Face Hub id.
-        device: where to put it.
+        device: where to put it; "auto" is the graphics card if there is one.
         factors, renderer: what it was made with, if its ``config.json`` cannot tell. A user's module that a
             model of the Hub names is imported only where it is given here.
 
@@ -175,4 +175,5 @@ def load(
         model = files.read_weights(folder, lambda: Derenderer(settings, factors, renderer))
         model = model.with_features(Features.load(folder, model.image_size))
     model.source = folder
+    device = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     return model.to(device).eval().requires_grad_(False)

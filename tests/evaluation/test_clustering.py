@@ -218,6 +218,7 @@ def test_one_call_averages_caps_clusters_and_scores(tracks, tmp_path):
     assert means.values["rows"]["geometry"]["scores"]["accuracy"]["value"] == 1
     assert (means.values["n_rows"], means.values["n_dropped_before"]) == (12, 1)
     assert means.to_pandas().loc["geometry", "accuracy"] == 1 and "| geometry |" in means.to_markdown()
+    assert cluster(tracks, "who", mean_by="track", **how).values["n_rows"] == 12  # one name, not its letters
     capped = cluster(tracks, "who", min_count=20, max_count=4, **how)
     assert (capped.values["n_rows"], capped.values["labels"]) == (8, {"who": 2})
     assert capped.values["n_dropped"] == len(tracks) - 8

@@ -49,8 +49,6 @@ from derender.evaluation.score_table import (
 )
 from derender.features import missing
 
-_DESCRIBED = ("identity", ["identity"], "class", ["class"])  # labels whose tables show descriptors, too
-
 
 def cluster(
     features: FeatureSource,
@@ -79,9 +77,10 @@ def cluster(
     Raises:
         ValueError: labels, factors or images do not fit.
     """
-    how = Options(**{"descriptors": label in _DESCRIBED, **options})
+    how = Options(**{"descriptors": label in ("identity", ["identity"], "class", ["class"]), **options})
     rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
+    mean_by = (mean_by,) if isinstance(mean_by, str) else mean_by
     ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)
     result = compare_clusterings(
         ready.features, ready.labels, controls=ready.controls, method=method, n_clusters=clusters,

@@ -112,6 +112,8 @@ def linear(
     Raises:
         ValueError: labels, factors, counts or images do not fit.
     """
+    heads = (heads,) if isinstance(heads, str) else heads
+    counts = (counts,) if isinstance(counts, int) else counts
     for head in heads:
         named(PROBES, head, "head")
     if finetune and not is_model(features):

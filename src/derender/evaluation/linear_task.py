@@ -85,7 +85,7 @@ def choose_rows(
     if not len(counts) or min(counts) < 2 or max(counts) > len(pool) or len(test) < 2:
         raise ValueError(
             f"asked to learn from {', '.join(map(str, counts)) or 'no'} labelled rows: {len(pool)} can be "
-            f"learned from and {len(test)} are tested; ask for 2 to {len(pool)}"
+            f"learned from and {len(test)} are tested; counts must lie in 2..{len(pool)}"
         )
     orders = [np.random.default_rng(seed).permutation(pool) for seed in seeds]
     return Rows(test, {count: np.stack([order[:count] for order in orders]) for count in counts})
