@@ -89,4 +89,5 @@ def test_what_cannot_be_packed_is_refused(unpacked, tmp_path, refused):
     pack = ("pack", "-m", unpacked, "-o")
     assert "add --force" in refused(*pack, tmp_path)
     assert "choose bytes or float16" in refused(*pack, tmp_path / "p", "--maps", "int4")
+    assert "give the images, too" in refused(*pack, tmp_path / "p", "--part", "test")
     assert not (tmp_path / "p").exists()

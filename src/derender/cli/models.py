@@ -33,6 +33,8 @@ def pack(
     original, chosen = model.open(), None
     if images.optional_address is not None:
         chosen = images.read(original.image_size, model=model.model, at_least=2)
+    elif images != PartOfImages():
+        raise ValueError("--dataset, --limit, --half and --part choose among images: give the images, too")
     packed = pack_model(model.model, out, maps=maps, overwrite=output.force)
     copy_split(packed.folder, model.model)
     sizes = {"before": sum(packed.before.values()), "after": sum(packed.after.values())}
