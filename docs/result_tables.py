@@ -4,19 +4,17 @@ A table is one of ``FILES``, each read by a function of its own, or a file of be
 its columns in it. There a row with ``hidden`` stays in the file.
 """
 
-import csv
 import json
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
+import paper_rows as theirs
 import renderer_tables as drawn
 import speed_tables as speed
+from paper_rows import RESULTS, kept
 from renderer_tables import spread
-
-RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 
 
 def table(name: str, keys: list[str] | None = None) -> str:
@@ -156,11 +154,6 @@ def side_by_side(heads: Mapping[str, str], key: str) -> Callable[[Any], Iterator
     return read
 
 
-def kept(name: str) -> Any:
-    """A file of benchmarks/results."""
-    return json.loads((RESULTS / name).read_text())
-
-
 def turned_and_lit(_: Any) -> Iterator[list[str]]:
     """Accuracy over growing angles: its mean, and at the largest."""
     yield ["", *(f"{what}: {where}" for what in ("yaw", "light") for where in ("area", "at the end"))]
@@ -176,47 +169,10 @@ def turned_and_lit(_: Any) -> Iterator[list[str]]:
             yield [f"{what}: {name}{note}", *cells]
 
 
-def beside_the_paper(_: Any) -> Iterator[list[str]]:
-    """Accuracy of Ward clusters beside the paper's rows; other data, so other numbers of the controls."""
-    parts = [kept(f"published/compare-{file}.json")["parts"][part] for file, part in PAPER.items()]
-    yield ["", "CelebA", "emotion", "identity"]
-    for name, row in parts[0]["rows"].items():
-        note = " (control)" if row["control"] else ""
-        yield [name + note, *(f"{part['rows'][name]['scores']['accuracy']['value']:.3f}" for part in parts)]
-    theirs = [{row["method"]: row["scores"]["accuracy"] for row in reversed(part["paper"])} for part in parts]
-    for method in [row["method"] for row in parts[0]["paper"]]:
-        yield [f"the paper: {method}", *(f"{part[method]:.3f}" for part in theirs)]
-
-
-def few_labels(result: Any) -> Iterator[list[str]]:
-    """Accuracy of the paper's head, frozen and fine-tuned, and the paper's own rows but StyleGAN2."""
-    columns = [(head, count) for count in (100, 1000) for head in ("linear", "fine-tuned")]
-    yield ["", *(f"{count:,} labels" + ", fine-tuned" * (head != "linear") for head, count in columns)]
-    parts = {(one["head"], one["labels"]): one["rows"] for one in result["parts"]["attributes"]["parts"]}
-    for name, row in parts["fine-tuned", 100].items():
-        found = {key: part.get(name) for key, part in parts.items()}
-        if not row["control"] or name == "untrained encoder":
-            shown = columns
-        else:  # controls without an encoder are not fine-tuned
-            shown = [key for key in columns if (key[0] == "linear") != (name.startswith("ResNet"))]
-        scores = (found[key] if key in shown else None for key in columns)
-        cells = ("" if one is None else f"{one['scores']['accuracy']['value']:.3f}" for one in scores)
-        yield [name + " (control)" * row["control"], *cells]
-    theirs: dict[str, dict[str, str]] = {}
-    with (RESULTS.parents[1] / "src" / "derender" / "evaluation" / "paper_tables.csv").open() as lines:
-        for line in csv.DictReader(lines):
-            if line["part"] == "linear" and line["method"] != "StyleGAN2":
-                theirs.setdefault(line["method"], {}).update({key: one for key, one in line.items() if one})
-    for method, own in theirs.items():
-        cells = (own.get(f"{head} {count}") for head, count in columns)
-        yield [f"the paper: {method}", *("" if one is None else f"{float(one):.3f}" for one in cells)]
-
-
 ROBUST = {
     "people": "generated/robustness-faces.json", "LFW": "published/robustness-lfw.json",
     "cars": "generated/robustness-cars.json",
 }  # fmt: skip
-PAPER = {"clustering": "attributes", "emotion": "emotion", "identity": "identity"}
 
 
 def part(name: str, digits: Mapping[str, int]) -> Callable[[Any], Iterator[list[str]]]:
@@ -266,17 +222,6 @@ def ladder(result: Any) -> Iterator[list[str]]:
             f"{controls[file][name]['scores'][key]['value']:.3f}" for file, key in LADDER_CONTROLS.items()
         )
         yield [f"{name} (control)", "", side.get(name, ""), *scores]
-
-
-def paper_preset(result: Any) -> Iterator[list[str]]:
-    yield ["LOOCC", "images", "ended with", "L1", "LFW, NMI", "pairs of LFW"]
-    for row in result["rows"]:
-        scores = (
-            f"{row['l1 of held-out images']:.3f}",
-            f"{row['LFW']['nmi']:.3f}",
-            f"{row['pairs']['accuracy']:.3f}",
-        )
-        yield [row["loocc"], f"{row['images']:,}", row["ended"], *scores]
 
 
 LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi", "identity_all.json": "<= 50"}
@@ -396,13 +341,16 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files,
     "large-classes": ("published/celeba.json published/races.json", side_by_side(LARGE, "accuracy")),
     "celeba-labels": ("published/celeba-labels.json", probed),
     "robustness-generated": (" ".join(ROBUST.values()), turned_and_lit),
-    "paper-clustering": (" ".join(f"published/compare-{one}.json" for one in PAPER), beside_the_paper),
-    "paper-linear": ("published/compare-linear.json", few_labels),
+    "paper-clustering": (
+        " ".join(f"published/compare-{one}.json" for one in theirs.PARTS),
+        theirs.beside_the_paper,
+    ),
+    "paper-linear": ("published/compare-linear.json", theirs.few_labels),
     "demo-depth": ("demo.json", part("geometry", {"SIDE x 100": 3, "MAD": 1})),
     "demo-people": ("demo.json", part("clustering", {"accuracy": 3, "NMI": 3})),
     "demo-images": ("demo.json", part("reconstruction", {"L1": 4, "PSNR": 2, "SSIM": 3})),
     "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
-    "paper-gpu": ("paper-gpu.json", paper_preset),
+    "paper-gpu": ("paper-gpu.json", theirs.preset),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
     "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
     "verification": ("verification.json", scored(PAIRS, "rows")),

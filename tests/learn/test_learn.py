@@ -35,7 +35,7 @@ def test_a_run_is_a_model_with_a_page_and_goes_on(run, images):
     assert derender.load(run).whitening is not None
     more = derender.train(images, out=run, resume=True, device="cpu")
     assert more.images == 16, "its own settings: there is nothing to do"
-    with pytest.raises(ValueError, match=r"on 40 images .*not on these 30 .*--start-from"):
+    with pytest.raises(ValueError, match=r"on 40 images .*not on these 30 .*start_from"):
         derender.train(images.select(slice(30)), out=run, resume=True, device="cpu")
     with pytest.raises(FileExistsError, match="is not empty"):
         derender.train(images, out=run, settings=TINY)

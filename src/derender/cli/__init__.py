@@ -76,7 +76,8 @@ _command = typer.main.get_command(app)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; gives the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    _command._main_shell_completion({}, "derender")  # where a shell asks for completions: answers and ends
+    if "_DERENDER_COMPLETE" in os.environ:  # a shell asks for completions
+        _command._main_shell_completion({}, "derender")  # answers and ends
     try:
         with (
             _command.make_context("derender", arguments) as context,  # typer's main hides what Ctrl-C said

@@ -116,7 +116,7 @@ def train(
         if began and (began.get("layout"), began.get("pictures")) != (images.layout, len(images)):
             raise ValueError(
                 f"{out} was trained on {began.get('pictures')} images ({began.get('layout')}), not on these "
-                f"{len(images)} ({images.layout}): resume with the same, or start a new run with --start-from"
+                f"{len(images)} ({images.layout}): resume with the same, or start a new run with start_from"
             )
     if on_images is not None:
         on_images(images)
