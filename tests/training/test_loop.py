@@ -192,6 +192,17 @@ def test_a_finished_run_gives_its_other_weights_when_resumed(worsening, pictures
     assert_model_is_of(run, "best")
 
 
+@pytest.mark.parametrize("change", ["images=64", "learning_rate=5e-5"])
+def test_a_finished_run_stays_as_it_is_where_a_change_would_train_nothing(change, worsening, pictures):
+    folder = worsening[0]
+    before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    with pytest.raises(
+        ValueError, match=rf"seen 96 images .*another \w*\.?{change.partition('=')[0]} .*raise images"
+    ):
+        train(resolve("small", [*WORSENING, change]), pictures, folder, resume=True)
+    assert before == {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
 def test_a_resumed_run_whose_best_checkpoint_is_damaged_leaves_the_model_alone(worsening, pictures, tmp_path):
     run = Path(shutil.copytree(worsening[0], tmp_path / "run"))
     before = model_of(run)

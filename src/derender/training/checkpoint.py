@@ -7,6 +7,7 @@ its place. So a run killed at any moment leaves a whole checkpoint behind; the l
 import json
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,6 +42,14 @@ class TrainState:
     best_loss: Annotated[float, Field(allow_inf_nan=False)] | None = None
     validations_since_best: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     watcher: dict[str, Any] = field(default_factory=dict)
+
+    def ended_by(self, config: Any) -> str | None:
+        """The setting that lets a run with these counters train no further, if there is one."""
+        if self.images >= config.images:
+            return "images"
+        if config.minutes is not None and self.seconds >= 60 * config.minutes:
+            return "minutes"
+        return "patience" if self.validations_since_best >= config.patience else None
 
 
 class _StateFile(BaseModel):
@@ -100,6 +109,14 @@ def resume_from(
     note = f"{last} {what}: going on from the checkpoint before it, of {state.images:,} images"
     warnings.warn(note, DamageNoticed, stacklevel=2)
     return state, note
+
+
+def read_state(folder: Path) -> TrainState:
+    """The counters of a checkpoint; without a whole file of them zeros."""
+    with suppress(ValueError, OSError):
+        stored = parse_json(read_bounded(folder / STATE_FILE), _StateFile)
+        return TypeAdapter(TrainState).validate_json(json.dumps(stored.state))
+    return TrainState()
 
 
 def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer | None) -> TrainState:

@@ -24,6 +24,7 @@ from derender.storage.bounded import (
     read_bounded,
     read_text,
 )
+from derender.training.checkpoint import read_state
 from derender.training.config import TrainConfig, config_from_tree, settings_by_name, to_yaml, without_removed
 from derender.training.process import LOCK_FILE
 
@@ -79,7 +80,7 @@ def refuse_taken(path: Path) -> None:
 
 
 def reopen_run(path: Path, config: Settings) -> RunFolder:
-    """The folder of a run to resume; no run is a FileNotFoundError, other settings are a ValueError."""
+    """The folder of a run to resume; no run is a FileNotFoundError, settings that do not fit a ValueError."""
     run = RunFolder(path)
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
@@ -91,6 +92,12 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
                 f"{path} was trained with another {key} ({stored.get(key)}, now {asked.get(key)}): "
                 "resume with the same settings, or start a new run in another folder"
             )
+    changed = [key for key in asked if key != "keep" and asked[key] != stored.get(key)]
+    if changed and (end := (state := read_state(run.last)).ended_by(config)):
+        raise ValueError(
+            f"{path} has seen {state.images:,} images and would train no further ({end}={asked[end]}), so "
+            f"another {changed[0]} has no effect: raise {end}, or resume with the run's own settings"
+        )
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)
     write_whole(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
