@@ -1,6 +1,7 @@
 """Renderers by name: found, refused, recorded with a model, and chosen for a training."""
 
 import json
+import pickle
 
 import pytest
 import torch
@@ -27,7 +28,9 @@ def test_a_model_is_saved_with_its_renderer_and_found_again(name, tmp_path, gene
     assert config["settings"]["renderer"] == name == model.renderer.name
     result, images = load(tmp_path / "m"), torch.rand(2, 3, 32, 32, generator=generator)
     assert [row.name for row in result.factors] == config["factors"] == [row.name for row in model.factors]
-    assert torch.equal(result.reconstruct(images).image, model.eval().reconstruct(images).image)
+    drawn = model.eval().reconstruct(images).image
+    assert torch.equal(result.reconstruct(images).image, drawn)
+    assert torch.equal(pickle.loads(pickle.dumps(model)).reconstruct(images).image, drawn)
     with pytest.raises(ValueError, match=r"was made with the renderer .*, not 'unheard-of'"):
         load(tmp_path / "m", renderer="unheard-of")
 

@@ -74,21 +74,22 @@ class Number:
 
 def numbers_factor(name: str, *numbers: Number, rate: float = 1.0) -> Factor:
     """A row of a few numbers, ``Scene.extra[name]`` (N, K); LOOCC draws each anew from its range."""
-
-    def valued(shares: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        return torch.stack([one.at(share) for one, share in zip(numbers, shares.unbind(1), strict=True)], 1)
-
-    def drawn(
-        value: Float[Tensor, "n k"], generator: Generator, settings: PerturbSettings, ranges: SceneRanges
-    ) -> Float[Tensor, "n k"]:
-        return valued(torch.rand(value.shape, generator=generator, device=generator.device).to(value))
-
-    def from_raw(raw: Float[Tensor, "n k"], ranges: SceneRanges) -> Float[Tensor, "n k"]:
-        share = raw.float() / 2 + 0.5
-        odds = share.new_tensor([one.start / (1 - one.start) for one in numbers])
-        return valued(odds * share / (1 - share + odds * share))
-
+    from_raw, drawn = partial(_ranged, numbers), partial(_drawn, numbers)
     return Factor(name, name, vector_net(len(numbers)), from_raw, False, drawn, numbers, rate)
+
+
+def _valued(numbers: tuple[Number, ...], shares: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    return torch.stack([one.at(share) for one, share in zip(numbers, shares.unbind(1), strict=True)], 1)
+
+
+def _drawn(numbers: tuple[Number, ...], value: Tensor, generator: Generator, *_: object) -> Tensor:
+    return _valued(numbers, torch.rand(value.shape, generator=generator, device=generator.device).to(value))
+
+
+def _ranged(numbers: tuple[Number, ...], raw: Float[Tensor, "n k"], ranges: SceneRanges) -> Tensor:
+    share = raw.float() / 2 + 0.5
+    odds = share.new_tensor([one.start / (1 - one.start) for one in numbers])
+    return _valued(numbers, odds * share / (1 - share + odds * share))
 
 
 def depth_from_raw(raw: Float[Tensor, "n 1 h w"], ranges: SceneRanges) -> Float[Tensor, "n h w"]:

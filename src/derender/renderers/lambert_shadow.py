@@ -8,6 +8,7 @@ occluders that the depth map does not hold: those outside the image, and what li
 """
 
 import math
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -27,11 +28,12 @@ def lambert_shadow(softness_deg: float = 5.0) -> Renderer:
     """Ambient + diffuse * visible * max(0, n.l); ``softness_deg``, 0.1..45: width of a shadow's edge."""
     if not 0.1 <= softness_deg <= 45:
         raise ValueError(f"renderer 'lambert-shadow': softness_deg must lie in 0.1..45, got {softness_deg:g}")
-
-    def visibility(scene: Scene, fov_deg: float) -> Tensor:
-        return visible(scene.depth, scene.light, fov_deg, softness_deg)
-
+    visibility = partial(_visibility, softness_deg)
     return Renderer("lambert-shadow", visibility=visibility, maps={"cast shadow": visibility})
+
+
+def _visibility(softness_deg: float, scene: Scene, fov_deg: float) -> Tensor:
+    return visible(scene.depth, scene.light, fov_deg, softness_deg)
 
 
 def visible(

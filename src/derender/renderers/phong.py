@@ -6,6 +6,8 @@ in the light's colour. The viewer stands where the scene's camera is, so a highl
 Leaves out Fresnel's law, and gloss that varies over the surface.
 """
 
+from functools import partial
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -34,12 +36,9 @@ def phong(gamma: float = 1.0, mean_diffuse: float = 0.0) -> Renderer:
         if not low <= value <= high:
             raise ValueError(f"renderer 'phong': {name} must lie in {low}..{high}, got {value:g}")
 
-    def penalty(scene: Scene, shading: Tensor) -> Tensor:
-        return mean_diffuse * (shading.mean(dim=(1, 2, 3)) - 0.5).square().mean()
-
     return Renderer(
         "phong", (SPECULAR,), specular=highlight, gamma=gamma, maps={"highlight": _map},
-        penalty=penalty if mean_diffuse else None,
+        penalty=partial(_penalty, mean_diffuse) if mean_diffuse else None,
     )  # fmt: skip
 
 
@@ -54,6 +53,10 @@ def highlight(scene: Scene, normal: Float[Tensor, "n h w 3"], fov_deg: float) ->
     cosine = (normal * half).sum(dim=-1)
     lobe = torch.where(lit & (cosine > 1e-4), cosine, 1.0) ** exponent * (lit & (cosine > 1e-4))
     return (strength * scene.light[:, 1, None, None] * lobe)[:, None]
+
+
+def _penalty(mean_diffuse: float, scene: Scene, shading: Tensor) -> Tensor:
+    return mean_diffuse * (shading.mean(dim=(1, 2, 3)) - 0.5).square().mean()
 
 
 def _map(scene: Scene, fov_deg: float) -> Float[Tensor, "n h w"]:
