@@ -1,5 +1,6 @@
 """`derender view` as a person meets it: what it prints, what it refuses, how it ends."""
 
+import http.client
 import json
 import signal
 import socket
@@ -8,6 +9,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from urllib.parse import urlsplit
 
 import pytest
 from tests.cli.conftest import noise
@@ -109,6 +111,26 @@ def test_it_answers_until_ctrl_c(model, photos, tmp_path):
         finally:
             process.kill()
     assert process.returncode == 0
+    assert message.strip() == "stopped"
+
+
+def test_ctrl_c_does_not_wait_for_a_running_fit(photos, tmp_path):
+    told = tmp_path / "told.json"
+    words = ["view", "-m", "rendered-faces-64", str(photos / "1.png"), "--json", str(told)]
+    command = [sys.executable, "-m", "derender", *words, "--fit-steps", "10000"]
+    with subprocess.Popen(command, text=True, stderr=subprocess.PIPE) as process:
+        try:
+            connection = http.client.HTTPConnection(urlsplit(_url(process, told)).netloc, timeout=60)
+            connection.request("POST", "/api/examples/0", headers={"X-Derender-Page": "1"})
+            time.sleep(3)
+            process.send_signal(signal.SIGINT)
+            began = time.monotonic()
+            _, message = process.communicate(timeout=60)
+            took = time.monotonic() - began
+            connection.close()
+        finally:
+            process.kill()
+    assert process.returncode == 0 and took < 5
     assert message.strip() == "stopped"
 
 

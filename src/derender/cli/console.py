@@ -139,6 +139,7 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
     text = json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n"
     if target == "-":
         sys.stdout.write(text)
+        sys.stdout.flush()
     else:
         from derender.storage.atomic import write_whole
 

@@ -1,5 +1,6 @@
 """`derender view`: the interactive page, served on this machine."""
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -65,7 +66,8 @@ def view(
         write_json(json_file, {"url": url, "host": host, "port": port, "model": model.model})
         serve(Application(studio, host), listener)
     except KeyboardInterrupt:  # where the shell has SIGINT ignored, the server ends without one
-        pass
+        notice("stopped")
+        os._exit(0)  # the usual end of a process waits for the threads, and so for a running fit
     finally:
         listener.close()
     notice("stopped")

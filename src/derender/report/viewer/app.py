@@ -149,10 +149,10 @@ class Application:
         handlers: dict[Any, Any] = dict.fromkeys((HTTPException, Refused, ClientDisconnect), _problem)
         self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
 
-    def close(self) -> None:
-        """End the threads and let go of the gallery's source."""
-        self._computing.shutdown(cancel_futures=True)
-        self._decoding.shutdown(cancel_futures=True)
+    def close(self, *, wait: bool = True) -> None:
+        """End the threads, by default after the work they have begun, and let go of the gallery's source."""
+        self._computing.shutdown(wait, cancel_futures=True)
+        self._decoding.shutdown(wait, cancel_futures=True)
         if self.studio.gallery is not None:
             self.studio.gallery.close()
 

@@ -174,7 +174,7 @@ def server_for(application: "Application") -> uvicorn.Server:
         server_header=False,
         proxy_headers=False,
         timeout_keep_alive=30,
-        timeout_graceful_shutdown=2,
+        timeout_graceful_shutdown=1,
         limit_concurrency=256,
         h11_max_incomplete_event_size=16_384,
     )
@@ -182,12 +182,14 @@ def server_for(application: "Application") -> uvicorn.Server:
 
 
 def serve(application: "Application", listener: socket.socket) -> None:
-    """Answer until Ctrl-C or SIGTERM."""
+    """Answer until Ctrl-C or SIGTERM; work that has begun then is not waited for."""
+    server = server_for(application)
+    logging.getLogger("uvicorn.error").addFilter(lambda _: not server.should_exit)  # ended answers are none
     try:
-        server_for(application).run(sockets=[listener])
+        server.run(sockets=[listener])
     finally:
         listener.close()
-        application.close()
+        application.close(wait=False)
 
 
 @contextmanager
