@@ -50,6 +50,12 @@ def test_every_form_of_picture_gives_the_same_features(model, pictures, tmp_path
         np.testing.assert_allclose(transformer.transform(form), expected, rtol=1e-4, atol=1e-4)
 
 
+def test_images_of_several_sizes_are_one_clear_error(model, pictures):
+    given = [*pictures.images[:2], pictures.images[2, :, :-1]]
+    with pytest.raises(ValueError, match=r"image 2 is \(3, \d+, \d+\), image 0 .*: resize them"):
+        DisentangledFeatures(model).transform(given)
+
+
 def test_the_model_is_loaded_late_once_and_a_copy_carries_its_path_not_its_weights(loads, pictures):
     transformer = DisentangledFeatures("runs/x")
     assert loads == []

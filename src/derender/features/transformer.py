@@ -85,6 +85,9 @@ def as_pixels(X: Any, image_size: int) -> np.ndarray:
     """Images in any of the forms DisentangledFeatures takes, as (N, 3, S, S), uint8 or float32 in 0..1."""
     if isinstance(X, (str, os.PathLike)):
         raise ValueError(f"expected several images, got the one path {str(X)!r}: give a list of paths")
+    shapes = [np.shape(item) for item in X] if isinstance(X, (list, tuple)) else []
+    if odd := next((number for number, shape in enumerate(shapes) if shape != shapes[0]), 0):
+        raise ValueError(f"image {odd} is {shapes[odd]}, image 0 {shapes[0]}: resize them, or give paths")
     array = X.detach().cpu().numpy() if isinstance(X, torch.Tensor) else np.asarray(X)
     if array.size and array.dtype.kind in "UO":
         if array.size != len(array):
