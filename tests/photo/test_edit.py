@@ -111,7 +111,10 @@ def test_what_is_no_image_is_refused_with_the_remedy(image, words, model):
         derender.relight(image, model)
 
 
-@pytest.mark.parametrize(("name", "value"), [("yaw_deg", 90.0), ("pitch_deg", -91.0), ("strength", -1.0)])
-def test_impossible_lights_are_refused(name, value, photo, model):
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("yaw_deg", 90.0), ("pitch_deg", -91.0), ("strength", -1.0), ("fit_steps", -1)],
+)
+def test_impossible_lights_and_steps_are_refused(name, value, photo, model):
     with pytest.raises(ValueError, match=name):
         derender.relight(photo, model, **{name: value})

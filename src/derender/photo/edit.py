@@ -146,6 +146,8 @@ def editable_scenes(model: Derenderer, images: Float[Tensor, "n 3 h w"], steps: 
 
 def editing_steps(model: Derenderer, steps: int | None) -> int:
     """Steps as given; None are ``FIT_STEPS`` if the model can be optimised per image, else 0."""
+    if steps is not None and steps < 0:
+        raise ValueError(f"fit_steps must be 0 or more, got {steps}")
     return steps if steps is not None else FIT_STEPS if model.fitting is not None else 0
 
 
