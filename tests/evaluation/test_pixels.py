@@ -59,6 +59,7 @@ def test_components_copy_what_lies_in_their_span():
     assert (again - torch.from_numpy(images / 255)).abs().max() < 0.01
     noise = generator.integers(0, 256, images.shape, dtype=np.uint8)
     assert (from_components(noise, images) - torch.from_numpy(noise / 255)).abs().mean() > 0.1
+    assert (from_components(images[:1], images[:1]) - torch.from_numpy(images[:1] / 255)).abs().max() < 1e-6
 
 
 def pair(count: int = 2, height: int = 24, width: int = 29) -> tuple[torch.Tensor, torch.Tensor]:

@@ -153,7 +153,8 @@ def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 
     from sklearn.decomposition import PCA
 
     known, flat = (np.asarray(one, np.float32).reshape(len(one), -1) / 255 for one in (fitted, images))
-    pca = PCA(component_count(len(fitted)), random_state=0).fit(known)
+    with np.errstate(invalid="ignore"):  # a single image has no variance
+        pca = PCA(component_count(len(fitted)), random_state=0).fit(known)
     again = pca.inverse_transform(pca.transform(flat)).astype(np.float32)
     return torch.from_numpy(again).clamp(0, 1).reshape(images.shape)
 
