@@ -1,6 +1,7 @@
 """read_images from end to end: order, labels aligned with what was kept, copies, faults; and splits."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.data.conftest import noise
 
-from derender.data import as_float, read_image, read_images, split_indices
+from derender.data import ImageSet, as_float, read_image, read_images, split_indices
 
 
 @pytest.mark.parametrize(("zipped", "workers"), [(False, 1), (False, 4), (True, 4)])
@@ -117,6 +118,11 @@ def test_as_float():
         torch.testing.assert_close(tensor.flatten(), torch.tensor([0, 0.2, 1]))
     tensor += 1
     assert images.max() == 255
+
+
+def test_images_of_numbers_are_refused():
+    with pytest.raises(ValueError, match=r"images must be bytes \(uint8\) of 0..255, got float32"):
+        ImageSet.__post_init__(SimpleNamespace(images=np.zeros((1, 3, 4, 4), np.float32)))  # types unchecked
 
 
 NAMES = [f"face_{row}.jpg" for row in range(1000)]

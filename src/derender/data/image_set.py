@@ -119,6 +119,8 @@ class ImageSet:
     terms: str = ""
 
     def __post_init__(self) -> None:
+        if self.images.dtype != np.uint8:
+            raise ValueError(f"images must be bytes (uint8) of 0..255, got {self.images.dtype}: convert them")
         columns = {"files": self.files, "partition": self.partition, **self.labels}
         for name, column in columns.items():
             if column is not None and len(column) != len(self.images):
