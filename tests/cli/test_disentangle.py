@@ -78,3 +78,10 @@ def test_geometry_beside_controls_with_intervals(model, rendered, tmp_path, numb
     assert rows["model"]["versus"]["l1"]["rival"] in rows
     assert 0 < told["factors"]["albedo"] <= told["factors"]["albedo_global"]
     assert told["factors"]["light_aligned"]["mean_deg"] <= told["factors"]["light"]["mean_deg"] + 1
+
+
+@pytest.mark.parametrize("protocol", ["geometry", "brightness"])
+def test_a_rendered_set_of_another_size_is_refused_with_what_to_do(protocol, rendered, refused):
+    printed = refused("evaluate", protocol, "-m", "rendered-faces-64", "-d", rendered)
+    assert "the images are 32x32, the model takes 64x64: render the set at that size" in printed
+    assert "--image-size 64" in printed and "or give another model" in printed

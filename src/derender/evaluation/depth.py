@@ -152,7 +152,7 @@ def evaluate_geometry(
     ``model`` has ``decompose``, ``render``, ``fov_deg``, ``image_size`` and ``device``; ``truth`` is at its
     image size. ``progress`` is called with (images done, images in all) after every batch.
     """
-    check_size(model, truth.images)
+    check_size(model, truth.images, rendered=True)
     depth, mask = torch.as_tensor(truth.depth), torch.as_tensor(truth.mask) > 0
     normal = None
     if truth.normal is not None:

@@ -159,7 +159,7 @@ def evaluate_factors(
     for name in ("albedo", "light", "camera"):
         if getattr(truth, name) is None:
             raise ValueError(f"this ground truth has no {name}: give a set that stores it")
-    check_size(model, truth.images)
+    check_size(model, truth.images, rendered=True)
 
     def see(batch: Tensor) -> tuple[Tensor, ...]:
         """Albedo and mask in the image's view (rendered under plain ambient light), light, camera."""

@@ -34,6 +34,7 @@ from derender.evaluation.pixels import reconstruction_scores
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import Column, Scores, scored_table
 from derender.features import map_batches, missing
+from derender.features.extract import check_size
 from derender.inputs import Progress, as_images, as_model
 from derender.model import Derenderer
 from derender.photo import PhotoDetail, editable_scenes
@@ -74,6 +75,7 @@ def brightness(
     if isinstance(images, ImageSet):
         raise ValueError("an image set holds no true albedo: give the address of a rendered set, or by")
     truth = read_ground_truth(images, limit=how.limit, image_size=model.image_size)
+    check_size(model, truth.images, rendered=True)
     if truth.albedo is None:
         raise ValueError(f"{images} stores no true albedo: give a set that does, or by")
     seen = {name: surfaces(net, truth.images, truth.mask, how.stage(name)) for name, net in nets.items()}

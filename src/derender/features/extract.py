@@ -97,13 +97,14 @@ def embed_image_set(
     return FeatureTable(images.files, factors, table_labels(images), facts)
 
 
-def check_size(model: Any, images: np.ndarray) -> None:
-    """Images (N, 3, H, W) of another size than the model's are an error."""
+def check_size(model: Any, images: np.ndarray, *, rendered: bool = False) -> None:
+    """Images (N, 3, H, W) of another size than the model's are an error; a ``rendered`` set has one size."""
     size, (height, width) = model.image_size, images.shape[-2:]
     if (height, width) != (size, size):
+        again = f"render the set at that size (derender synth ... --image-size {size}), or give another model"
         raise ValueError(
             f"the images are {height}x{width}, the model takes {size}x{size}: "
-            f"read them with image_size={size}"
+            f"{again if rendered else f'read them with image_size={size}'}"
         )
 
 
