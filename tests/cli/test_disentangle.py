@@ -85,3 +85,8 @@ def test_a_rendered_set_of_another_size_is_refused_with_what_to_do(protocol, ren
     printed = refused("evaluate", protocol, "-m", "rendered-faces-64", "-d", rendered)
     assert "the images are 32x32, the model takes 64x64: render the set at that size" in printed
     assert "--image-size 64" in printed and "or give another model" in printed
+
+
+def test_brightness_of_photographs_asks_for_groups(model, rendered, refused):
+    printed = refused("evaluate", "brightness", "-m", model, "-d", rendered / "images")
+    assert "for photographs name a label of groups (--by LABEL)" in printed

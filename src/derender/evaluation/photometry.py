@@ -74,10 +74,13 @@ def brightness(
         return _by_group(nets, how.at(model.image_size), by, how)
     if isinstance(images, ImageSet):
         raise ValueError("an image set holds no true albedo: give the address of a rendered set, or by")
-    truth = read_ground_truth(images, limit=how.limit, image_size=model.image_size)
+    try:
+        truth = read_ground_truth(images, limit=how.limit, image_size=model.image_size)
+    except ValueError as error:
+        raise ValueError(f"{error}; for photographs name a label of groups (--by LABEL)") from error
     check_size(model, truth.images, rendered=True)
     if truth.albedo is None:
-        raise ValueError(f"{images} stores no true albedo: give a set that does, or by")
+        raise ValueError(f"{images} stores no true albedo: give a set that does, or by (--by LABEL)")
     seen = {name: surfaces(net, truth.images, truth.mask, how.stage(name)) for name, net in nets.items()}
     inside = truth.mask[:, None]
     mean = (truth.albedo * inside).sum(axis=(2, 3)) / inside.sum(axis=(2, 3))
