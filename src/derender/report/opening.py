@@ -97,7 +97,7 @@ class ImageOpener:
         self.detail = self.options.detail or default_detail
         self.whole = whole and self.detail == "photo" and not self.options.only_frame
         if self.size < model.image_size:
-            raise ValueError(f"size {self.size} is below the model's {model.image_size}: give that or more")
+            raise ValueError(f"size {self.size} is below the model's: give --size {model.image_size} or more")
 
     def open(self, path: str | Path) -> OpenedImage:
         """One image with its scene as it is to be drawn."""
