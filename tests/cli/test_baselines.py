@@ -69,7 +69,8 @@ def test_controls_need_no_model(name, size, faces, run, tmp_path):
     part = [*embed[:-1], tmp_path / "part.parquet", "--part", "test", "--model", run]
     assert call(*part) == 0
     test = FeatureTable.read(tmp_path / "part.parquet")
-    assert len(test) == 2 and (name != "pca" or test.origin["fitted_on"] == 19)
+    assert len(test) == 2 and test.origin["part"] == "test" and "part" not in table.origin
+    assert name != "pca" or test.origin["fitted_on"] == 19
 
 
 def test_controls_keep_copies_where_asked_and_name_unreadable_files(tmp_path, capsys, refused):

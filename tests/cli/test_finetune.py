@@ -44,7 +44,8 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
     assert (out / "report.html").is_file()
     table = tmp_path / "t.parquet"
     assert run("embed", "-m", out, "-d", faces, "--part", "test", "--out", table) == 0
-    assert FeatureTable.read(table).factors["geometry"].shape == (8, 256)
+    tested = FeatureTable.read(table)
+    assert tested.factors["geometry"].shape == (8, 256) and tested.origin["part"] == "test"
     again = ["finetune", "-d", faces, "--out", out, "--resume", "--cache", tmp_path / "cache"]
     capsys.readouterr()
     assert run(*again, "--json", "-") == 0

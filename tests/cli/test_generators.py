@@ -46,7 +46,8 @@ def test_a_generator_its_inversion_and_its_parts(faces, e4e, tmp_path, capsys):
     assert (e4e / "report.html").is_file() and list((e4e / "samples").glob("*.png"))
     embed = ["embed", "-d", data, "--out", table, "--force", "--baseline"]
     assert run(*embed, "e4e", "--model", e4e, "--part", "test") == 0
-    assert FeatureTable.read(table).factors["w+"].shape == (2, 8 * 6)
+    read = FeatureTable.read(table)
+    assert read.factors["w+"].shape == (2, 8 * 6) and read.origin["part"] == "test"
     assert run(*embed, "stylegan2", "--model", e4e.parent / "gan") == 0
     assert FeatureTable.read(table).factors["discriminator"].shape == (24, 6)
 

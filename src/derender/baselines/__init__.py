@@ -6,6 +6,7 @@ Everything is imported on first use. The class of a network holds its features, 
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,8 +114,9 @@ def embed_baseline(
     table = control_features(
         name, images, part=part, model=source, components=components, seed=seed, progress=progress
     )
-    table.write(out)
-    widths, origin = {name: table.factors[name].shape[1]}, dict(table.origin)
+    widths, origin = {name: table.factors[name].shape[1]}, {**table.origin}
+    origin |= {} if part == "all" else {"part": part}
+    replace(table, origin=origin).write(out)
     facts = origin["data"], origin["layout"]
     counts = len(images.skipped), images.skipped[:LISTED_SKIPPED], len(images.duplicates), 0
     kept = reading.get("keep_duplicates", False)

@@ -96,6 +96,7 @@ def embed(
     net, origin = _network(model, device, fit_steps)
     how = {"dataset": dataset, "limit": limit, "part": part, "model": origin.get("source")}
     read = as_images(images, net.image_size, **how)
+    origin |= {} if part == "all" else {"part": part}
     return embed_image_set(net, read, batch_size=batch_size, progress=progress, origin=origin)
 
 
@@ -143,7 +144,7 @@ def embed_to_file(
                 split = {**made_by, **(origin or {})}.get("source")
                 how = {"dataset": dataset, "limit": limit, "part": part, "model": split}
                 how["keep_duplicates"] = keep_duplicates
-                images = as_images(address, net.image_size, **how)
+                images, made_by["part"] = as_images(address, net.image_size, **how), part
         assert isinstance(images, Stream | ImageSet)
         facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
         plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
