@@ -11,9 +11,11 @@ from PIL import Image
 
 import derender
 from derender.cli import main
+from derender.data.synthetic import faces
+from derender.data.synthetic.settings import FaceSettings
 from derender.photo import Face, Frame, find_faces
 from derender.photo.align import AFFINE, COLUMNS, _write
-from derender.photo.faces import RENDERED, UTKFACE, YAW_PER_SHARE
+from derender.photo.faces import RENDERED, TEMPLATES, UTKFACE, YAW_PER_SHARE, frame_of
 from derender.report.viewer.images import rendered_examples
 
 MODULE = sys.modules["derender.photo.align"]  # the package has the function by that name
@@ -48,7 +50,7 @@ def photos(tmp_path_factory):
 @pytest.fixture(scope="module")
 def aligned(photos, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "aligned"
-    return derender.align(photos, out, size=128, model="rendered-faces-64"), out
+    return derender.align(photos, out, size=128, model="rendered-faces-128"), out
 
 
 def test_every_face_lies_where_the_model_has_it(aligned):
@@ -61,6 +63,15 @@ def test_every_face_lies_where_the_model_has_it(aligned):
         assert np.abs(face.points / 256 - RENDERED)[[0, 1, 3, 4]].max() < 0.04  # the nose turns
     reasons = {row["photo"]: row["rejected"] for row in done.rows if not row["file"]}
     assert reasons["none.png"] == "no face found" and "known format" in reasons["broken.jpg"]
+
+
+def test_heads_of_either_family_keep_nearly_their_training_frame():
+    made = faces.generate(8, 256, seed=3, settings=FaceSettings(pictures_per_identity=1)).images
+    for images in (made.transpose(0, 2, 3, 1), [np.asarray(head(number, 256)) for number in range(8)]):
+        results = [
+            frame_of(face, TEMPLATES["rendered-faces-64"]) for one in images for face in find_faces(one)
+        ]
+        assert len(results) >= 6 and abs(np.median([one.side for one in results]) / 256 - 1) < 0.08
 
 
 def test_the_transform_leads_back_into_the_photograph(aligned, photos):
