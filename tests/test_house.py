@@ -16,27 +16,27 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (7_440, 32),
-    "evaluation": (7_625, 38),  # public functions name their errors
+    "data": (7_445, 32),
+    "evaluation": (7_630, 38),  # public functions name their errors
     "report": (4_040, 25),
     "cli": (2_305, 32),  # pack refuses options without effect
-    "training": (3_515, 17),  # CUDA graphs
+    "training": (3_530, 17),  # CUDA graphs
     "baselines": (2_480, 11),
     "render": (1_690, 15),
-    "features": (1_380, 8),
+    "features": (1_385, 8),
     "interpretation": (1_085, 5),
-    "photo": (1_500, 7),  # new light falls on the object alone
+    "photo": (1_505, 7),  # new light falls on the object alone
     "networks": (710, 5),
     "storage": (940, 8),
     "objectives": (640, 5),
     "postprocess": (790, 6),
     "scene": (860, 11),
     "demo": (520, 3),
-    "renderers": (660, 8),
+    "renderers": (665, 8),
     "learn": (940, 5),
 }
-TOTAL = (39_680, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_720
+TOTAL = (39_720, 248)  # on the way to (37_000, 270)
+TEST_LINES = 25_795
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

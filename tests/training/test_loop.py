@@ -52,7 +52,8 @@ def assert_same_weights(one, two):
 
 def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
     def sheet(model, images):
-        return Image.fromarray((model.reconstruct(images).image[0, 0].clamp(0, 1) * 255).byte().numpy())
+        grey = model.reconstruct(images).image[0, 0].clamp(0, 1) * 255
+        return Image.fromarray(grey.byte().cpu().numpy())
 
     seen: list[Progress] = []
     config = resolve("small", [*TINY, "images=128", "whitening.pictures=16"])
@@ -98,8 +99,8 @@ def test_a_mapped_set_is_trained_on_where_it_lies_and_gives_the_same_weights(pic
     read = Batches.read
     monkeypatch.setattr(Batches, "read", lambda self, *at: sizes.append(len(self.images)) or read(self, *at))
     config = resolve("small", [*TINY, "images=32"])
-    train(config, held, tmp_path / "mapped")
-    train(config, pictures, tmp_path / "copied")
+    train(config, held, tmp_path / "mapped", accelerator="cpu")
+    train(config, pictures, tmp_path / "copied", accelerator="cpu")
     assert_same_weights(tmp_path / "mapped", tmp_path / "copied")
     assert sizes[0] == 60 > sizes[-1]
 
@@ -141,7 +142,7 @@ def test_patience_ends_a_run_that_no_longer_improves(pictures, tmp_path):
 def worsening(pictures, tmp_path_factory):
     """A finished run that ends worse than it was: its rate is far too large."""
     folder = tmp_path_factory.mktemp("worsening") / "run"
-    result = train(resolve("small", WORSENING), pictures, folder)
+    result = train(resolve("small", WORSENING), pictures, folder, accelerator="cpu")
     assert 0 < result.model_images < result.images == 96
     return folder, result
 

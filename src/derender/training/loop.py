@@ -258,14 +258,9 @@ class _Run:
 
     def why_stop(self) -> str | None:
         """The reason that ends the run now, if there is one."""
-        config, state = self.config, self.state
         if any(finding.fatal for finding in self.findings):
             return "collapse"
-        if state.images >= config.images:
-            return "images"
-        if config.minutes is not None and state.seconds >= 60 * config.minutes:
-            return "minutes"
-        return "patience" if state.validations_since_best >= config.patience else None
+        return self.state.ended_by(self.config)
 
     def validate(self) -> None:
         """Score held-out images; keep the weights if they are the best so far."""
