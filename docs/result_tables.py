@@ -202,17 +202,26 @@ RUNGS = {
 }  # fmt: skip
 
 
-def ladder(result: Any) -> Iterator[list[str]]:
-    """Means and deviations over the seeds that did not collapse, of each addition."""
+def averaged(result: Any, title: str, names: Mapping[str, str]) -> Iterator[list[str]]:
+    """Means and deviations over the seeds that did not collapse, of each kind of run named."""
     keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3, "Yale B <= 50": 3}
-    yield ["each row adds to the one above", "whole runs", *RUNG_TITLES]
-    for rung, name in RUNGS.items():
+    yield [title, "whole runs", *RUNG_TITLES]
+    for rung, name in names.items():
         seeds = [row for row in result["rows"] if row["rung"] == rung]
         whole = [row for row in seeds if not row["collapsed"]]
         if seeds:
             values = {key: [row[key] for row in whole if key in row] for key in keys}
             cells = (spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
             yield [name, f"{len(whole)} of {len(seeds)}", *cells]
+
+
+def joint(result: Any) -> Iterator[list[str]]:
+    names = {"factor": "one contrast for each factor", "joint": "codes side by side (Eq. 6)"}
+    return averaged(result, "LOOCC", names)
+
+
+def ladder(result: Any) -> Iterator[list[str]]:
+    yield from averaged(result, "each row adds to the one above", RUNGS)
     controls = {file: kept(file)["rows"] for file in LADDER_CONTROLS}
     depth = kept("generated/heads.json")["intervals"]["geometry"]
     side = {name: f"{100 * depth[row]['scores']['side']['value']:.2f}" for name, row in LADDER_DEPTH.items()}
@@ -227,6 +236,14 @@ def ladder(result: Any) -> Iterator[list[str]]:
 LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi", "identity_all.json": "<= 50"}
 LADDER_DEPTH = {"average depth": "average depth", "untrained encoder": "untrained model"}
 RUNG_TITLES = ("SIDE x 100", "tracks, NMI", "LFW, NMI", "Yale B to 50°")
+
+
+def sharp(result: Any) -> Iterator[list[str]]:
+    """Reconstructions at 128 pixels of models of two sizes."""
+    first, *_ = result["rows"].values()
+    yield ["", *first]
+    for name, row in result["rows"].items():
+        yield [name, *(spread([row[key]], 4 if key == "L1" else 3) for key in first)]
 
 
 def true_factors(result: Any) -> Iterator[list[str]]:
@@ -327,6 +344,7 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files,
     "gpu-agreement": ("gpu.json", speed.gpu_agreement),
     "fitting": ("fitting.json", speed.fitting),
     "heads-generated": (f"generated/heads.json {FITTED}", with_steps(scored(DEPTH, *GEOMETRY), FITTED)),
+    "faces-128": ("sharpness.json", sharp),
     "heads-128": ("generated/heads-128.json", scored(DEPTH, *GEOMETRY)),
     "factors-generated": (f"generated/heads.json {FITTED}", with_steps(scored(FACTORS, *TRUE), FITTED)),
     "people-lfw": ("published/lfw.json", scored(CLUSTERS, "rows")),
@@ -350,6 +368,7 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files,
     "demo-people": ("demo.json", part("clustering", {"accuracy": 3, "NMI": 3})),
     "demo-images": ("demo.json", part("reconstruction", {"L1": 4, "PSNR": 2, "SSIM": 3})),
     "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
+    "loocc-joint": ("loocc-joint.json", joint),
     "paper-gpu": ("paper-gpu.json", theirs.preset),
     "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
     "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
