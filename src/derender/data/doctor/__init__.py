@@ -249,7 +249,7 @@ def doctor(
     originals = None
     if not isinstance(images, ImageSet):
         source = images
-        if Path(source).is_file() and is_image(str(source)):
+        if isinstance(source, str | Path) and Path(source).is_file() and is_image(str(source)):
             raise ValueError(f"{source} is one image: a set is examined as a whole, give its folder or zip")
         how = {"dataset": dataset, "limit": limit, "keep_duplicates": True, "progress": progress}
         images = read_images(source, EXAMINED_PX, **how)
