@@ -6,6 +6,7 @@ from pathlib import Path
 from derender.cli import options, scoring
 from derender.cli.console import notice, progress_bar, refuse_existing, report_images, result
 from derender.cli.options import command, option
+from derender.storage.atomic import require_replaceable
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ def explain(
     """Which factor made the answer, and where was it seen? Shares, maps, and controls for both."""
     if out is not None:
         refuse_existing(out, published.force)
+        require_replaceable(out, True, "explain.html")
     if bool(label) == attributes:
         raise ValueError("give either --label NAME (may be repeated) or --attributes")
     import derender

@@ -11,7 +11,7 @@ from derender.data import ImageSet, Progress, split_indices
 from derender.inputs import as_images, as_model, copy_split
 from derender.learn.runs import Changes, OnImages, texts_of
 from derender.model import Derenderer
-from derender.storage.atomic import new_folder
+from derender.storage.atomic import new_folder, require_replaceable
 from derender.storage.places import model_folder
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.distillation import RefineConfig
@@ -128,8 +128,7 @@ class _Copying:
         part: str = "all", device: str = "auto", overwrite: bool = False, on_images: OnImages | None = None,
         progress: Progress | None = None, **reading: Any,
     ):  # fmt: skip
-        if out.exists() and not overwrite:
-            raise FileExistsError(f"{out} exists already: choose another folder or pass overwrite=True")
+        require_replaceable(out, overwrite)
         self.out, self.part, self.overwrite, self.progress = out, part, overwrite, progress
         self.model = as_model(model, device=device)
         self.source = self.model.source if isinstance(model, Derenderer) else model

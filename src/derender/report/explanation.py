@@ -28,7 +28,7 @@ from derender.report.charts import INK, SERIES, side_by_side
 from derender.report.colours import Images, pictures
 from derender.report.page import Page
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid
-from derender.storage.atomic import atomic_folder
+from derender.storage.atomic import atomic_folder, require_replaceable
 
 STRENGTH = 0.75
 LAYOUT = GridLayout(cell=128, gap=6, label=13, title=18)
@@ -133,8 +133,9 @@ def write_explanation(
 
     ``sheets`` labels get maps, best distinguished first, with so many ``rows`` of images; ``progress`` is
     called with (labels done, labels in all). Returns the explanation with ``checks``: how the maps answer to
-    fresh weights.
+    fresh weights. A FileExistsError: the folder holds other files.
     """
+    require_replaceable(Path(out), True, "explain.html")
     drawn, checks = draw_maps(explained, labels=sheets, rows=rows, progress=progress)
     explained = replace(explained, checks=checks)
     svg, png = share_chart(explained.shares)

@@ -94,12 +94,18 @@ def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Pat
 
 @contextmanager
 def new_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """`atomic_folder` for a folder that must not exist yet, unless ``overwrite`` allows it."""
-    folder = Path(folder)
-    if folder.exists() and not overwrite:
-        raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+    """`atomic_folder` for a folder that must not exist yet, unless ``overwrite`` replaces a saved one."""
+    require_replaceable(folder := Path(folder), overwrite)
     with atomic_folder(folder) as temporary:
         yield temporary
+
+
+def require_replaceable(folder: Path, overwrite: bool, marker: str = "config.json") -> None:
+    """FileExistsError where a folder is there: without ``overwrite``, or with files but not this one."""
+    if folder.exists() and not overwrite:
+        raise FileExistsError(f"{folder} exists already: choose another folder or pass overwrite=True")
+    if folder.exists() and not (folder / marker).is_file() and (folder.is_file() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} has no {marker}, and its files would be lost: choose another folder")
 
 
 def remove_abandoned(path: Path) -> None:

@@ -358,4 +358,4 @@ def _full_key(key: str, names: Iterable[str]) -> str:
     guess = suggestion(key, names) or suggestion(
         key.rsplit(".", 1)[-1], [name.rsplit(".", 1)[-1] for name in names]
     )
-    raise ValueError(f"unknown setting {key!r}{guess}: 'derender train --dry-run' lists all of them")
+    raise ValueError(f"unknown setting {key!r}{guess}: --dry-run lists all of them")
