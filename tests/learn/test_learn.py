@@ -5,6 +5,7 @@ import pytest
 
 import derender
 from derender.data import ImageSet
+from derender.inputs import split_of
 from derender.learn import finetune_settings, run_settings
 
 TINY = {
@@ -45,6 +46,8 @@ def test_a_run_is_a_model_with_a_page_and_goes_on(run, images):
 
 def test_a_copy_is_made_of_a_model_or_of_its_place(run, images, tmp_path):
     changes = {"whitening.pictures": 12, "whitening.views": 1, "fitting.examples": 8}
+    given = derender.load(run).save_pretrained(tmp_path / "given", data="heads", licence="MIT")
+    assert split_of(given) == split_of(run) is not None, "shared as it was loaded, it keeps the run's split"
     one = derender.whiten(derender.load(run), images, out=tmp_path / "one", settings=changes)
     two = derender.whiten(run, images, out=tmp_path / "two", settings=changes)
     assert one.values()["between_over_within"] == two.scores["between_over_within"]
