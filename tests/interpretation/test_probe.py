@@ -50,7 +50,7 @@ def test_probes_answer_as_the_projects_own_heads(features, labels, name):
 
 def test_a_probe_comes_back_from_its_folder(features, labels, tmp_path):
     probe = fit_probe(features, task_of({"smiling": labels["smiling"]}), np.arange(N))
-    back = load_probe(probe.save(tmp_path / "probe"))
+    back = load_probe(probe.save(probe.save(tmp_path / "probe"), overwrite=True))
     np.testing.assert_array_equal(back.weight, probe.weight)
     assert (back.names, back.kind, back.sizes) == (probe.names, probe.kind, probe.sizes)
     np.testing.assert_allclose(back.probabilities(features), expit(probe.logits(features)))

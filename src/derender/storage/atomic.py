@@ -93,9 +93,9 @@ def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Pat
 
 
 @contextmanager
-def new_folder(folder: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(folder: str | Path, *, overwrite: bool = False, marker: str = "config.json") -> Iterator[Path]:
     """`atomic_folder` for a folder that must not exist yet, unless ``overwrite`` replaces a saved one."""
-    require_replaceable(folder := Path(folder), overwrite)
+    require_replaceable(folder := Path(folder), overwrite, marker)
     with atomic_folder(folder) as temporary:
         yield temporary
 
