@@ -243,7 +243,7 @@ def sharp(result: Any) -> Iterator[list[str]]:
     first, *_ = result["rows"].values()
     yield ["", *first]
     for name, row in result["rows"].items():
-        yield [name, *(spread([row[key]], 4 if key == "L1" else 3) for key in first)]
+        yield [name, *(f"{row[key]:.{4 if key == 'L1' else 3}f}" for key in first)]
 
 
 def true_factors(result: Any) -> Iterator[list[str]]:

@@ -124,13 +124,12 @@ def test_ctrl_c_does_not_wait_for_a_running_fit(photos, tmp_path):
             connection.request("POST", "/api/examples/0", headers={"X-Derender-Page": "1"})
             time.sleep(3)
             process.send_signal(signal.SIGINT)
-            began = time.monotonic()
             _, message = process.communicate(timeout=60)
-            took = time.monotonic() - began
+            assert connection.getresponse().status == 500  # the fit was not waited for
             connection.close()
         finally:
             process.kill()
-    assert process.returncode == 0 and took < 5
+    assert process.returncode == 0
     assert message.strip() == "stopped"
 
 
