@@ -44,7 +44,7 @@ $(DATA)/faces-128: | $(STAMP)
 	@rm -rf $@.part; $(BIN)/derender synth faces --benchmark --image-size 128 --out $@.part && mv $@.part $@
 
 HEADS := evaluate geometry $(DATA)/faces/test --model rendered-faces-64
-HEADS-FITTED := $(HEADS) --fit-steps 60
+HEADS-FITTED := $(HEADS) --fit-steps 20
 BRIGHTNESS := evaluate brightness $(DATA)/faces/test --model rendered-faces-64
 PEOPLE := evaluate cluster $(DATA)/faces/tracks --model rendered-faces-64 --label identity --mean-by identity --mean-by track
 CARS-CLUSTERS := evaluate cluster $(DATA)/cars/test --model cars-64 --label class
@@ -74,14 +74,14 @@ PUBLISHED := benchmarks/results/published
 LFW := --label identity --min-count 20 --max-count 20
 published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make published IMAGES=folder (two hours, resumable)
 	@mkdir -p build; test -f build/lfw-fitted.parquet || $(BIN)/derender embed $(IMAGES)/lfw64.zip --model faces-64 \
-	  --fit-steps 60 --keep-duplicates --out build/lfw-fitted.parquet
+	  --fit-steps 20 --keep-duplicates --out build/lfw-fitted.parquet
 	@for step in "lfw evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW)" \
 	  "lfw-fitted evaluate cluster --features build/lfw-fitted.parquet $(LFW)" \
 	  "lfw-finch evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW) --method finch" \
 	  "disentanglement-lfw evaluate disentangle $(IMAGES)/lfw64.zip --model faces-64 --limit 800 --seeds 2" \
 	  "reconstruction-utkface evaluate reconstruction $(IMAGES)/utkface64.zip --model faces-64 --part test" \
 	  "reconstruction-lfw evaluate reconstruction $(IMAGES)/lfw64.zip --model faces-64 --limit 800" \
-	  "reconstruction-lfw-fitted evaluate reconstruction $(IMAGES)/lfw64.zip --model faces-64 --limit 800 --fit-steps 60" \
+	  "reconstruction-lfw-fitted evaluate reconstruction $(IMAGES)/lfw64.zip --model faces-64 --limit 800 --fit-steps 20" \
 	  "races evaluate cluster $(IMAGES)/utkface64.zip --model faces-64 --limit 4000 --label race --resamples 200" \
 	  "celeba-labels evaluate linear $(IMAGES)/celeba64.zip --model faces-64 --attributes --heads linear,centred,logistic --resamples 200 --seeds 1" \
 	  "robustness-lfw evaluate robustness $(IMAGES)/lfw64.zip --model faces-64 --pictures render $(LFW)" \

@@ -29,14 +29,14 @@ BUDGET = {  # lines, files
     "networks": (710, 5),
     "storage": (945, 8),  # only saved folders are replaced
     "objectives": (640, 5),
-    "postprocess": (790, 6),
+    "postprocess": (845, 6),
     "scene": (860, 11),
     "demo": (520, 3),
     "renderers": (665, 8),
     "learn": (940, 5),
 }
-TOTAL = (39_730, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_800
+TOTAL = (39_785, 248)  # on the way to (37_000, 270)
+TEST_LINES = 25_815
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -168,3 +168,13 @@ def test_a_file_of_something_else_is_refused(tmp_path, tensors, told):
     save_file({"length": torch.ones(()), **tensors}, file, metadata=told)
     with pytest.raises(ValueError, match="holds no fitting"):
         Fitting.load(file)
+
+
+def test_measured_directions_lead_further_than_the_coordinates_themselves(monkeypatch):
+    images = torch.from_numpy(np.ascontiguousarray(faces.generate(8, 64, seed=5).images)).float() / 255
+    along = derender.load("rendered-faces-64").fit_scenes(images, 12)
+    monkeypatch.setattr(Fitting, "_measured", lambda self, render, rates, sizes: torch.eye(len(rates)))
+    monkeypatch.setattr("derender.postprocess.fitting._STEP", 1.0)
+    plain = derender.load("rendered-faces-64").fit_scenes(images, 12)
+    assert torch.equal(along.before, plain.before)
+    assert (along.before - along.after).mean() > 1.15 * (plain.before - plain.after).mean()

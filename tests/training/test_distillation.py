@@ -16,7 +16,7 @@ from derender.training.features import make_features
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = distillation.RefiningSettings(
-    images=192, batch_size=8, learning_rate=5e-4, fit_steps=8, rendered=0.25, worst=0, picture_weight=0
+    images=192, batch_size=8, learning_rate=5e-4, fit_steps=4, rendered=0.25, worst=0, picture_weight=0
 )
 FEW = {"pictures": 16, "views": 2, "directions": 8, "spatial": False}
 PARTS = {"refining": LESSONS.model_dump(), "whitening": FEW, "fitting": {"examples": 16}}

@@ -42,7 +42,7 @@ LIMIT = "Read at most N images: evenly spaced, or the first of a stream."
 BATCH = "Images per batch; changes speed and memory only."
 PART = "all, or the train, validation or test part of the model's training split."
 SEED = "Seed of every random choice: sampling, splits, initial weights."
-FIT = "Optimise each scene against its image by rendering, in N steps (60, say; slow)."
+FIT = "Optimise each scene against its image by rendering, in N steps (20, say; slow)."
 SETTING = "Change one setting; may be repeated. The reference of settings lists all."
 Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
 Images = Annotated[str | None, typer.Argument(help=IMAGES, metavar="IMAGES", show_default=False)]

@@ -163,6 +163,8 @@ class EmbeddingModel(nn.Module):
         fitting, nets = self.features.required_fitting(), dict[str, Any](self.nets)
         rows = [row for row in self.factors if not (row.mirrored or row.parameter in ("light", "camera"))]
         ranged = [lambda raw, own=row: own.to_parameter(raw, self.settings.ranges) for row in rows]
+        with torch.no_grad():
+            typical = self.decode(self.encode(torch.full_like(images[:1], 0.5)))
 
         def fitted(portion: Tensor) -> Fitted:
             few = len(portion) if portion.is_cuda else FEW
@@ -171,7 +173,7 @@ class EmbeddingModel(nn.Module):
                 scene = Scene.joined([self.decode(one) for one in codes])
                 raws = [torch.cat([nets[row.name].decoder(one[row.name]) for one in codes]) for row in rows]
             further = list(zip([row.parameter for row in rows], raws, ranged, strict=True))
-            return fitting.fit(portion, scene, self.render, steps, further)
+            return fitting.fit(portion, scene, self.render, steps, further, typical)
 
         result = Fitted.joined(_by_portions(fitted, images), len(images))
         return replace(result, scene=self.balanced(result.scene))

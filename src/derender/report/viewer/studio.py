@@ -28,6 +28,7 @@ from derender.model import Derenderer
 from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
 from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
+from derender.postprocess.fitting import STEPS
 from derender.report import colours
 from derender.report.decomposition import factor_images
 from derender.report.mesh import model_mesh
@@ -59,7 +60,6 @@ from derender.training.held_out_errors import (
 PHOTOGRAPHS_KEPT = 6  # ready to be drawn
 LARGEST_PHOTO = 4096
 PREVIEW_SIZE, SURFACE_SIZE = 1024, 128
-FIT_STEPS = 60
 FILM_SIZE, FILM_FRAMES, FILM_SECONDS = 384, 24, 3.0
 FILM_LIGHT_DEG, FILM_VIEW_DEG = 50.0, 20.0
 
@@ -132,7 +132,7 @@ class Studio:
             framed = "own"
         elif crop is not None:
             frame, framed = self._found(opened.photo, opened.faces, crop)
-        steps = (self.fit_steps or FIT_STEPS) if question.fit else 0
+        steps = (self.fit_steps or STEPS) if question.fit else 0
         return self._decomposed(opened.photo, opened.faces, frame, framed, steps)
 
     def _found(self, photo: np.ndarray, faces: Sequence[Frame], way: str | None) -> tuple[Frame, str]:
