@@ -36,7 +36,7 @@ _CAMERA = [(0.01, -math.radians(75), math.radians(75))] * 3 + [(0.003, -0.4, 0.4
 _FURTHER = (0.05, -4.0, 4.0)  # what a network gives before its tanh
 _LATE, _LATE_RATE = 0.7, 0.3  # from this share of the steps on rates are multiplied by this
 _STEP, _MOMENTUM = 0.3, (0.7, 0.95)  # Adam's, along directions in which a step of 1 changes the loss alike
-_DAMPING = 0.04  # of the steepest direction: flatter ones are taken for as steep
+_DAMPING = 0.02  # of the steepest direction: flatter ones are taken for as steep
 _TYPICAL = ((0.4, -0.6, -0.15, 0.35), (-0.4, 0.6, 0.15, -0.35))
 """Pitch and yaw of the light and of the camera (radians) where the steepness of the loss is measured."""
 _NEAR = 4.0  # differences that measure it: half a standard deviation, 0.04 radians
