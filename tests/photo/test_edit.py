@@ -8,9 +8,9 @@ from tests.photo.test_align import scene
 
 import derender
 from derender.photo import Frame, find_faces, found_frame, open_photograph
+from derender.photo.edit import FIT_STEPS
 from derender.photo.faces import RENDERED, frame_of
 from derender.postprocess import Features
-from derender.postprocess.fitting import STEPS
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_scenes_are_optimised_before_they_are_edited(photo, model):
     def light(steps: int | None = None) -> torch.Tensor:
         return open_photograph(np.asarray(photo), model, fit_steps=steps).scene.light
 
-    assert torch.equal(light(), light(STEPS))
+    assert torch.equal(light(), light(FIT_STEPS))
     assert not torch.equal(light(), light(0))
     unable = model.with_features(Features(model.whitening))
     assert model.fitting is not None and unable.fitting is None

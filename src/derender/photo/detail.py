@@ -107,7 +107,7 @@ class PhotoDetail:
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
         moved = (inside * shift)[..., ::4, ::4].norm(dim=1).amax(dim=(1, 2))[:, None, None, None] / self.grid
         seen = 1 - inside * (1 - torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED)))
-        mirror_seen = inside * (1 - seen) * mirrored[:, 2:3]
+        mirror_seen = inside * (1 - seen) * mirrored[:, 2:3] * mirrored[:, -1:]
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         change = (ratio.log().square() * inside).sum(dim=(2, 3)) / inside.sum(dim=(2, 3)).clamp(min=1)
         change = change[:, :, None, None].square() + (2 * moved).square()

@@ -23,7 +23,6 @@ from derender.model import Derenderer
 from derender.photo.detail import PhotoDetail
 from derender.photo.faces import PROFILE_DEG, UTKFACE, find_faces, frame_of, template_of
 from derender.photo.frame import Frame
-from derender.postprocess.fitting import STEPS
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.crop import SEARCH_SCALE, best_crop
@@ -31,6 +30,9 @@ from derender.storage.places import require_known
 
 AMBIENT_SHARE = 0.35
 """Of a light's strength; the rest is diffuse."""
+
+FIT_STEPS = 10
+"""Steps that optimise a scene before it is edited, if the model can; with more, new light fits heads less."""
 
 LARGEST_CROP = 1024
 """Side of the largest crop that is drawn pixel by pixel; of larger ones the change is enlarged."""
@@ -143,10 +145,10 @@ def editable_scenes(model: Derenderer, images: Float[Tensor, "n 3 h w"], steps: 
 
 
 def editing_steps(model: Derenderer, steps: int | None) -> int:
-    """Steps as given; None are ``STEPS`` if the model can be optimised per image, else 0."""
+    """Steps as given; None are ``FIT_STEPS`` if the model can be optimised per image, else 0."""
     if steps is not None and steps < 0:
         raise ValueError(f"fit_steps must be 0 or more, got {steps}")
-    return steps if steps is not None else STEPS if model.fitting is not None else 0
+    return steps if steps is not None else FIT_STEPS if model.fitting is not None else 0
 
 
 def relight(

@@ -153,7 +153,7 @@ class EmbeddingModel(nn.Module):
     def fit_scenes(self, images: GivenImages, steps: int = STEPS) -> Fitted:
         """Scenes optimised per image, from ``decompose`` on, downhill through the renderer.
 
-        A hundred times as slow as ``decompose``, with a smaller error, also under other lighting and
+        Some five times as slow as ``decompose``, with a smaller error, also under other lighting and
         viewpoints. On a CPU an image's scene is the same whatever images stand beside it, on any number of
         threads. A model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
