@@ -10,6 +10,7 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering wi
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -159,7 +160,8 @@ def compare_clusterings(
     numbers = {name: _numbered(values[labelled], name) for name, values in columns.items()}
     sizes = {name: int(values.max()) + 1 for name, values in numbers.items()}
     clusters = {name: size if n_clusters is None else n_clusters for name, size in sizes.items()}
-    n_rows, once = int(labelled.sum()), np.ones((1, labelled.sum()), np.float32)
+    n_rows = int(labelled.sum())
+    once = np.ones((1, n_rows), np.float32)
 
     runs, starts = {}, range(seed, seed + (5 if method == "k-means" else 1))
     for name, arrays in features.items():
@@ -171,21 +173,18 @@ def compare_clusterings(
 
     scorers = {name: [_scorer(numbers, run) for run in own] for name, own in runs.items()}
     drawn: dict[str, list[np.ndarray]] = {name: [] for name in runs}
-    for weights in resamples(n_rows, resample_count, seed):
+    for weights in chain([once], resamples(n_rows, resample_count, seed)):
         for name, own in scorers.items():
-            drawn[name].append(np.stack([score(weights).mean(axis=1) for score in own]))
+            drawn[name].append(np.stack([score(weights) for score in own]))
     rows, per_label = [], {}
-    for name, own in scorers.items():
-        plain = np.stack([score(once)[0] for score in own])  # (runs, labels, scores)
-        resampled = np.concatenate(drawn[name], axis=1).mean(axis=0)
-        quiet = name in controls or name == "majority"
+    for name, parts in drawn.items():
+        values = np.concatenate(parts, axis=1)  # (runs, 1 + resamples, labels, scores)
+        quiet = {*controls, "majority"}
         rows.append(
-            scored_row(name, quiet, tuple(METRICS), plain.mean(axis=1), resampled, centred=True, most=1.0)
+            scored_row(name, name in quiet, tuple(METRICS), values.mean(axis=2), centred=True, most=1.0)
         )
-        per_label[name] = {
-            label: dict(zip(METRICS, values, strict=True))
-            for label, values in zip(labels, plain[0].tolist(), strict=True)
-        }
+        first_run = zip(labels, values[0, 0].tolist(), strict=True)
+        per_label[name] = {label: dict(zip(METRICS, own, strict=True)) for label, own in first_run}
     orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
     deals = [_scorer(numbers, {label: own[order] for label, own in first.items()}) for order in orders]
     chance = np.stack([deal(once)[0].mean(axis=0) for deal in deals], axis=1)

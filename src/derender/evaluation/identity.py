@@ -17,8 +17,8 @@ from derender.evaluation.bootstrap import (
     ScoredRow,
     constant,
     estimate,
-    group_resamples,
     numbers_of,
+    once_and_resampled,
     with_verdicts,
 )
 from derender.evaluation.clustering import compare_clusterings
@@ -237,8 +237,7 @@ def verify(
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
-    drawn = group_resamples(np.arange(len(pairs)), how.resamples, how.seed)
-    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every pair once
+    weights = once_and_resampled(len(pairs), how.resamples, how.seed)
     scored, errors = [], {}
     for row in rows:
         runs = [_judged(run, sides, pairs) for run in row.arrays()]

@@ -32,9 +32,9 @@ from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
     constant,
+    estimate,
     numbers_of,
-    resamples,
-    scored_row,
+    once_and_resampled,
     with_verdicts,
 )
 from derender.evaluation.controls import UNTRAINED, subject_and_controls
@@ -58,7 +58,7 @@ from derender.evaluation.linear_probes import (
     probabilities,
     probe_runs,
 )
-from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, linear_scores, task_of
+from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, mean_precision, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table, verdict_table
@@ -244,7 +244,7 @@ def compare_linear(
     """
     check_lengths(features, len(task))
     truth = task.targets[rows.test]
-    weights = np.concatenate(list(resamples(len(rows.test), resample_count)))
+    weights = once_and_resampled(len(rows.test), resample_count)
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
     for head in (*heads, *([FINETUNED] if finetuned else [])):
         for count, own in rows.train.items():
@@ -270,12 +270,13 @@ def _row(
     name: str, control: bool, answers: np.ndarray, truth: np.ndarray, kind: str, weights: np.ndarray
 ) -> ScoredRow:
     """Scores of (S, T, A) answers; average precision has no interval."""
-    runs = [linear_scores(truth, answer, kind) for answer in answers]
-    resampled = np.mean([count_scores(truth, answer, kind, weights) for answer in answers], axis=0)
-    plain = np.array([(run.accuracy, run.balanced_accuracy) for run in runs])
-    row = scored_row(name, control, ("accuracy", "balanced_accuracy"), plain, resampled)
-    precision = constant([run.average_precision for run in runs], len(weights))
-    return replace(row, scores={**row.scores, "average_precision": precision})
+    counted = np.stack([count_scores(truth, answer, kind, weights) for answer in answers])
+    plain, drawn = counted[:, 0].astype(np.float64), counted[:, 1:].mean(axis=0)
+    both = enumerate(("accuracy", "balanced_accuracy"))
+    scores = {score: estimate(plain[:, at], drawn[:, at]) for at, score in both}
+    precisions = [mean_precision(truth, answer) for answer in answers]
+    scores["average_precision"] = constant(precisions, len(weights) - 1)
+    return ScoredRow(name, control, len(answers), scores)
 
 
 def linear_tables(result: LinearComparison) -> list[ScoreTable]:

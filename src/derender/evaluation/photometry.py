@@ -27,7 +27,7 @@ from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, read_ground_truth
 from derender.data.image_set import as_float
 from derender.evaluation.angles import agreement, agreement_table
-from derender.evaluation.bootstrap import ScoredRow, estimate, group_resamples, numbers_of
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
 from derender.evaluation.image_scores import binned_rows, image_rows, image_verdicts
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import reconstruction_scores
@@ -87,7 +87,7 @@ def brightness(
     nothing = np.ones(len(mean))
     seen["image as albedo"] = {"albedo": seen["model"]["image"], "light": nothing}
     people = truth.labels.get("identity", np.arange(len(mean))).astype(str)
-    weights = group_resamples(people, how.resamples, how.seed)
+    weights = once_and_resampled(people, how.resamples, how.seed)
     caption = f"Brightness of albedo, 0 to 1: {len(mean):,} images of {len(set(people))} surfaces"
     bright = {name: one["albedo"] @ LUMA for name, one in seen.items()}
     table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
@@ -135,29 +135,29 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     if len(names) < 2:
         raise ValueError(f"{by!r} has {len(names)} groups: two or more are needed")
     seen = {name: surfaces(net, images.images, None, how.stage(name)) for name, net in nets.items()}
-    weights = group_resamples(np.arange(len(group)), how.resamples, how.seed).astype(np.float64)
-    once, member = np.ones((1, len(group))), (group[:, None] == names).astype(np.float64)
+    weights = once_and_resampled(len(group), how.resamples, how.seed).astype(np.float64)
+    member = (group[:, None] == names).astype(np.float64)
 
-    def means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def means(values: np.ndarray) -> np.ndarray:
         return (weights * values) @ member / np.maximum(weights @ member, 1e-9)
 
-    def share(bright: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        own, shown = (np.log(np.maximum(means(one, weights), 1e-6)) for one in (bright, picture))
+    def share(bright: np.ndarray) -> Estimate:
+        own, shown = (np.log(np.maximum(means(one), 1e-6)) for one in (bright, picture))
         own, shown = (one - one.mean(axis=1, keepdims=True) for one in (own, shown))
-        return (own * shown).sum(axis=1) / (shown * shown).sum(axis=1)
+        values = (own * shown).sum(axis=1) / (shown * shown).sum(axis=1)
+        return estimate(values[:1], values[1:])
 
     picture = seen["model"]["image"] @ LUMA
     shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
-    result = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
+    result = {what: means(one) for what, one in shown.items()}
     groups = []
     for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True)):
-        scores = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in result.items()}
+        scores = {what: estimate(own[:1, at], own[1:, at]) for what, own in result.items()}
         groups.append(ScoredRow(f"{name} ({int(number):,})", False, 1, scores))
     columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in result}
     columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
-    taken = {name: estimate(share(one, once), share(one, weights)) for name, one in answers.items()}
-    shares = [ScoredRow(name, at > 0, 1, {"share": one}) for at, (name, one) in enumerate(taken.items())]
+    shares = [ScoredRow(name, name != "model", 1, {"share": share(one)}) for name, one in answers.items()]
     caption = f"Brightness of {by}, {len(group):,} images"
     tables = [
         scored_table(caption, "prediction", shares, {"share": _SHARE}, deviations=()),

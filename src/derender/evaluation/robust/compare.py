@@ -17,8 +17,8 @@ from derender.data import ImageSet
 from derender.evaluation.bootstrap import (
     RESAMPLES,
     ScoredRow,
-    group_resamples,
     numbers_of,
+    once_and_resampled,
     scored_row,
     with_verdicts,
 )
@@ -311,8 +311,7 @@ def _scored(
     units = [trial.unit[rows] for rows in curve.points]
     draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
     seeds = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
-    drawn = [group_resamples(own, count, one) for own, one in zip(units, seeds, strict=True)]
-    weights = [np.concatenate((np.ones_like(own[:1]), own)) for own in drawn]  # first every row once
+    weights = [once_and_resampled(own, count, one) for own, one in zip(units, seeds, strict=True)]
     names = (ORDINARY, AREA, *map(level_name, curve.levels))
 
     def scores(run: np.ndarray) -> np.ndarray:
@@ -325,7 +324,6 @@ def _scored(
     result: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
     for name, runs in answers.items():
         both = np.stack([scores(run) for run in runs])
-        plain, resampled = both[:, 0], both[:, 1:].mean(axis=0)
         for at, rows in enumerate(result.values()):
-            rows.append(scored_row(name, name in controls, names, plain[..., at], resampled[..., at]))
+            rows.append(scored_row(name, name in controls, names, both[..., at]))
     return {score: with_verdicts(rows) for score, rows in result.items()}

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from derender.data import read_masks
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, resamples, scored_row, with_verdicts
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, once_and_resampled, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
 from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
@@ -191,14 +191,13 @@ def segment(
         losses = nets.train_segmenter(net, data, seed, settings, step)
         return {**counted(nets.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
-    drawn = np.concatenate(list(resamples(len(data.test), resample_count)))
-    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every image once
+    weights = once_and_resampled(len(data.test), resample_count)
 
     def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
         result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
         iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
         losses = np.array([run["losses"] for run in runs if trainable])
-        scored = scored_row(title, control, tuple(COLUMNS), result[:, 0], result[:, 1:].mean(axis=0))
+        scored = scored_row(title, control, tuple(COLUMNS), result)
         return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
     rows = []
