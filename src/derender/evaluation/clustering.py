@@ -127,13 +127,6 @@ class ClusterComparison:
         return {**vars(self), "rows": numbers_of(self.rows)}
 
 
-def about_clustering(method: str, n_rows: int, labels: Mapping[str, int]) -> str:
-    """Method, rows and labels in words; ``labels`` holds the number of classes by name."""
-    (name, classes), *others = labels.items()
-    what = f"mean of {len(labels)} labels" if others else f"{classes} classes of {name}"
-    return f"{METHODS[method]}: {n_rows:,} rows, {what}"
-
-
 def compare_clusterings(
     features: Mapping[str, Sequence[np.ndarray]],
     labels: Mapping[str, np.ndarray],
@@ -239,7 +232,9 @@ def _scorer(
 
 def clustering_table(result: ClusterComparison) -> ScoreTable:
     """One row for each feature and control, every score."""
-    caption = about_clustering(result.method, result.n_rows, result.labels)
+    (name, classes), *others = result.labels.items()
+    what = f"mean of {len(result.labels)} labels" if others else f"{classes} classes of {name}"
+    caption = f"{METHODS[result.method]}: {result.n_rows:,} rows, {what}"
     if result.n_dropped:
         caption += f"; {result.n_dropped:,} rows without label left out"
     if result.n_missing:

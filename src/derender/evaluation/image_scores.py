@@ -12,6 +12,7 @@ from math import isfinite
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from torch import Tensor
 
 from derender.evaluation import bootstrap
 from derender.evaluation.score_table import Column, ScoreTable, scored_table
@@ -56,6 +57,12 @@ class ImageResult:
             intervals=() if rows is None else tuple(self.columns), deviations=(), more=more, over="images",
         )  # fmt: skip
         return replace(result, rows=[replace(row, note=self.notes.get(row.name, "")) for row in result.rows])
+
+
+def means_and_each(**scores: Tensor) -> dict[str, Any]:
+    """The mean of (N,) values of each score over the images that have one; all of them as ``SCORE_each``."""
+    means = {name: values.nanmean().item() for name, values in scores.items()}
+    return means | {f"{name}_each": values.numpy(force=True) for name, values in scores.items()}
 
 
 def image_rows(

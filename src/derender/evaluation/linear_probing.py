@@ -245,6 +245,17 @@ def compare_linear(
     check_lengths(features, len(task))
     truth = task.targets[rows.test]
     weights = once_and_resampled(len(rows.test), resample_count)
+
+    def scored(name: str, answers: np.ndarray) -> ScoredRow:
+        """Scores of (S, T, A) answers; average precision has no interval."""
+        counted = np.stack([count_scores(truth, answer, task.kind, weights) for answer in answers])
+        plain, drawn = counted[:, 0].astype(np.float64), counted[:, 1:].mean(axis=0)
+        both = enumerate(("accuracy", "balanced_accuracy"))
+        scores = {score: estimate(plain[:, at], drawn[:, at]) for at, score in both}
+        precisions = [mean_precision(truth, answer) for answer in answers]
+        scores["average_precision"] = constant(precisions, resample_count)
+        return ScoredRow(name, name in {*controls, "majority"}, len(answers), scores)
+
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
     for head in (*heads, *([FINETUNED] if finetuned else [])):
         for count, own in rows.train.items():
@@ -257,26 +268,9 @@ def compare_linear(
                 if progress is not None:
                     progress(done, total)
             answers["majority"] = majority_answers(task, own, len(truth))
-            scored = [
-                _row(name, name in controls or name == "majority", one, truth, task.kind, weights)
-                for name, one in answers.items()
-            ]
-            parts.append(LinearPart(head, count, with_verdicts(scored)))
+            parts.append(LinearPart(head, count, with_verdicts([*map(scored, answers, answers.values())])))
     dropped = int((~task.known).sum())
     return LinearComparison(tuple(parts), task.kind, task.names, len(rows.test), dropped, tuple(seeds))
-
-
-def _row(
-    name: str, control: bool, answers: np.ndarray, truth: np.ndarray, kind: str, weights: np.ndarray
-) -> ScoredRow:
-    """Scores of (S, T, A) answers; average precision has no interval."""
-    counted = np.stack([count_scores(truth, answer, kind, weights) for answer in answers])
-    plain, drawn = counted[:, 0].astype(np.float64), counted[:, 1:].mean(axis=0)
-    both = enumerate(("accuracy", "balanced_accuracy"))
-    scores = {score: estimate(plain[:, at], drawn[:, at]) for at, score in both}
-    precisions = [mean_precision(truth, answer) for answer in answers]
-    scores["average_precision"] = constant(precisions, len(weights) - 1)
-    return ScoredRow(name, control, len(answers), scores)
 
 
 def linear_tables(result: LinearComparison) -> list[ScoreTable]:

@@ -161,9 +161,8 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
 
     Values and classes that no row has do not count.
     """
-    once = np.ones((1, len(targets)), np.float32)
-    both = count_scores(targets, probabilities, kind, once)[0]
-    return LinearScores(*both.tolist(), mean_precision(targets, probabilities))
+    accuracy, balanced = count_scores(targets, probabilities, kind, np.ones((1, len(targets)), np.float32))[0]
+    return LinearScores(float(accuracy), float(balanced), mean_precision(targets, probabilities))
 
 
 def mean_precision(targets: np.ndarray, probabilities: np.ndarray) -> float:

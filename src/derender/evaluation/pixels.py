@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.evaluation.image_scores import ImageResult
+from derender.evaluation.image_scores import ImageResult, means_and_each
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 
@@ -89,17 +89,9 @@ def reconstruction_scores(
     difference = torch.where(weight > 0, prediction.double() - target.double(), 0.0)
     l1 = (weight * difference.abs()).sum(dim=(1, 2, 3)) / total
     psnr = -10 * ((weight * difference.square()).sum(dim=(1, 2, 3)) / total).log10()
-    ssim = masked_ssim(prediction, target, mask)
-    return ReconstructionScores(
-        l1=l1.nanmean().item(),
-        psnr_db=psnr.nanmean().item(),
-        coverage=mask.double().mean().item(),
-        n_empty=int((total == 0).sum()),
-        l1_each=l1.numpy(force=True),
-        psnr_db_each=psnr.numpy(force=True),
-        ssim=ssim.nanmean().item(),
-        ssim_each=ssim.numpy(force=True),
-    )
+    scores = means_and_each(l1=l1, psnr_db=psnr, ssim=masked_ssim(prediction, target, mask))
+    coverage, n_empty = mask.double().mean().item(), int((total == 0).sum())
+    return ReconstructionScores(coverage=coverage, n_empty=n_empty, **scores)
 
 
 def mean_image(images: np.ndarray) -> Float[Tensor, "3 h w"]:

@@ -7,6 +7,7 @@ the same for all features, angles and scores, so that differences are paired.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -276,6 +277,31 @@ def compare_robustness(
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
     tested = np.unique(np.concatenate([rows for curve in trial.curves for rows in curve.points]))
+
+    def scored(curve: Curve, answers: Mapping[str, np.ndarray]) -> dict[str, tuple[ScoredRow, ...]]:
+        """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
+        truths = [task.targets[rows] for rows in curve.points]
+        places = [np.searchsorted(tested, rows) for rows in curve.points]
+        units = [trial.unit[rows] for rows in curve.points]
+        draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
+        starts = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
+        weights = list(map(once_and_resampled, units, repeat(resample_count), starts))
+        names = (ORDINARY, AREA, *map(level_name, curve.levels))
+
+        def scores(run: np.ndarray) -> np.ndarray:
+            """(1 + B, 1 + points, 2) both scores, the area second."""
+            asked = zip(truths, places, weights, strict=True)
+            ordinary, *levels = (count_scores(truth, run[at], task.kind, own) for truth, at, own in asked)
+            area = area_under(curve.levels, np.stack(levels, axis=-1))
+            return np.stack((ordinary, area, *levels), axis=1)
+
+        result: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
+        for name, runs in answers.items():
+            both = np.stack([scores(run) for run in runs])
+            for at, rows in enumerate(result.values()):
+                rows.append(scored_row(name, name in {*controls, "majority"}, names, both[..., at]))
+        return {score: with_verdicts(rows) for score, rows in result.items()}
+
     known: dict[bytes, dict[str, np.ndarray]] = {}  # answers by training rows: most curves share these
     total, curves, n_learned = len({one.learn.tobytes() for one in trial.curves}) * len(features), [], {}
     for curve in trial.curves:
@@ -288,42 +314,8 @@ def compare_robustness(
                 if progress is not None:
                     progress(sum(map(len, known.values())), total)
         both = {**answers, "majority": majority_answers(task, draws, len(tested))}
-        rows = _scored(curve, trial, both, tested, {*controls, "majority"}, resample_count, seed)
         sizes = tuple(map(len, curve.points))
-        curves.append(CurveResult(curve.name, curve.title, curve.levels, sizes, rows))
+        curves.append(CurveResult(curve.name, curve.title, curve.levels, sizes, scored(curve, both)))
     return RobustnessComparison(
         tuple(curves), trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
     )
-
-
-def _scored(
-    curve: Curve,
-    trial: Trial,
-    answers: Mapping[str, np.ndarray],
-    tested: np.ndarray,
-    controls: Collection[str],
-    count: int,
-    seed: int,
-) -> dict[str, tuple[ScoredRow, ...]]:
-    """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
-    truths = [trial.task.targets[rows] for rows in curve.points]
-    places = [np.searchsorted(tested, rows) for rows in curve.points]
-    units = [trial.unit[rows] for rows in curve.points]
-    draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
-    seeds = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
-    weights = [once_and_resampled(own, count, one) for own, one in zip(units, seeds, strict=True)]
-    names = (ORDINARY, AREA, *map(level_name, curve.levels))
-
-    def scores(run: np.ndarray) -> np.ndarray:
-        """(1 + B, 1 + points, 2) both scores, the area second."""
-        asked = zip(truths, places, weights, strict=True)
-        ordinary, *levels = (count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked)
-        area = area_under(curve.levels, np.stack(levels, axis=-1))
-        return np.stack((ordinary, area, *levels), axis=1)
-
-    result: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
-    for name, runs in answers.items():
-        both = np.stack([scores(run) for run in runs])
-        for at, rows in enumerate(result.values()):
-            rows.append(scored_row(name, name in controls, names, both[..., at]))
-    return {score: with_verdicts(rows) for score, rows in result.items()}
