@@ -129,8 +129,8 @@ def _angles(
 
         parts = map_batches(see, net, read.images, batch_size=64, progress=how.stage(name))
         results[name] = np.concatenate(parts)
-    people = read.labels.get("identity", np.array(read.files))
-    weights = once_and_resampled(people.astype(str), how.resamples, how.seed)
+    people = read.labels.get("identity", np.array(read.files)).astype(str)
+    weights = once_and_resampled(people, how.resamples, how.seed)
     tables: list[ScoreTable] = []
     values: dict[str, Any] = {"pictures": len(read)}
     for column, name in enumerate(labels):
@@ -139,25 +139,18 @@ def _angles(
         shown, values[name] = agreement_table(caption, answers, true[:, column], weights)
         tables.append(shown)
     if what == "Light":
-        rows, columns = _directions(results, true, people.astype(str), how)
+        aim = _unit(true)
+        aimed = {name: _unit(angles) for name, angles in results.items()}
+        aimed["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
+        apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in aimed.items()}
+        off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
+        rows, columns, _ = binned_rows(
+            apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
+        )
         caption = "Light: degrees between true and predicted direction, by the angle between light and view"
         tables.append(scored_table(caption, "prediction", rows, columns, deviations=()))
         values["direction"] = numbers_of(rows)
     return Scores(tables, values, how.notes)
-
-
-def _directions(
-    result: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
-) -> tuple[Sequence[ScoredRow], Mapping[str, Column]]:
-    """Angle between true and predicted direction, all and by the angle between light and view."""
-    aim = _unit(true)
-    answers = {name: _unit(angles) for name, angles in result.items()}
-    answers["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
-    off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
-    apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in answers.items()}
-    return binned_rows(
-        apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
-    )[:2]
 
 
 def known_angles(

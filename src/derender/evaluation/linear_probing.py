@@ -27,6 +27,7 @@ import torch
 from torch import nn
 
 from derender.baselines.controls import untrained_twin
+from derender.baselines.supervised import fresh_resnet18
 from derender.data import as_float
 from derender.evaluation.bootstrap import (
     RESAMPLES,
@@ -202,7 +203,12 @@ def compare_prepared(
         learn = partial(finetune, model, images, task, training, split.test, factors=chosen, **how)
         return options.memory.recall_one("finetuned", inputs, learn)
 
-    trained = trained_models(models or {}, seeds, options.device, supervised)
+    trained = {name: [opened(run, options.device) for run in runs] for name, runs in (models or {}).items()}
+    if ours := [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]:
+        trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
+    if supervised:
+        size, device = next(iter(trained.values()))[0].image_size, device_named(options.device)
+        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device) for seed in seeds]
     tuned = {
         name: {
             count: np.stack([learned(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
@@ -343,19 +349,3 @@ def finetune(
     with torch.inference_mode():
         parts = np.array_split(tested, max(1, len(tested) // 256))
         return np.concatenate([probabilities(head(embed(part)), task.kind).cpu().numpy() for part in parts])
-
-
-def trained_models(
-    models: Mapping[str, Sequence[ModelSource]], seeds: Sequence[int], device: str, supervised: bool
-) -> dict[str, list[Any]]:
-    """By row name, the models to train: those given, untrained ones, and ResNet-18 with fresh weights."""
-    trained = {name: [opened(run, device) for run in runs] for name, runs in models.items()}
-    ours = [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]
-    if ours:
-        trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
-    if supervised:
-        from derender.baselines.supervised import fresh_resnet18
-
-        size = next(iter(trained.values()))[0].image_size
-        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device_named(device)) for seed in seeds]
-    return trained

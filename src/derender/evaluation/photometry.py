@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
@@ -214,6 +213,9 @@ def relight(
     lit = list(zip(read.labels[NEEDED[1]].tolist(), read.labels[NEEDED[2]].tolist(), strict=True))
     place = {(person, light): row for row, (person, light) in enumerate(zip(who, lit, strict=True))}
     people, photos, rows = sorted(set(who.tolist())), as_float(large.images), []
+    down, across = (round(share * photos.shape[-1]) for share in BORDER.get(read.layout, (0, 0)))
+    photographed = torch.zeros(photos.shape[-2:])  # 1 where a photograph is not its border
+    photographed[down : len(photographed) - down, across : len(photographed) - across] = 1
     apart: dict[str, dict[str, list[np.ndarray]]] = {"PSNR": {}, "SSIM": {}}
     progress = how.stage("relighting", "people")
     for number, person in enumerate(people):
@@ -231,7 +233,8 @@ def relight(
             target = scenes[[source] * len(lent)].with_parameters(light=scenes.light[lent])
             edited = PhotoDetail(photos[source], scenes[source], model.fov_deg)(target)
             rendered = model.render(at_size(target, photos.shape[-1]))
-            mask = _mask(model, scenes[source], photos.shape[-1], read.layout)
+            drawn = model.render(at_size(scenes[source], photos.shape[-1])).mask > 0.5
+        mask = drawn.float().cpu() * photographed
         answers = (
             edited.image,
             rendered.image,
@@ -260,12 +263,3 @@ def relight(
         values[title.lower()] = numbers_of(scored)
         notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": columns["all"]})]
     return Scores(tables, values, notes)
-
-
-def _mask(model: Derenderer, scene: Scene, size: int, layout: str) -> Float[Tensor, "1 s s"]:
-    """Where the model draws a surface into the photograph, 0 or 1."""
-    mask = (model.render(at_size(scene, size)).mask > 0.5).float().cpu()
-    down, across = (round(share * size) for share in BORDER.get(layout, (0, 0)))
-    inner = torch.zeros_like(mask)
-    inner[:, down : size - down, across : size - across] = 1
-    return mask * inner

@@ -16,8 +16,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
+from sklearn.decomposition import PCA
 from torch import Tensor
 
+from derender.baselines.controls import flat_pixels
 from derender.evaluation.image_scores import ImageResult, means_and_each
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
@@ -142,12 +144,9 @@ def component_count(images: int, most: int = COMPONENTS) -> int:
 
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:
     """uint8 images (N, 3, H, W) from the principal components of (M, 3, H, W) others alone, in 0..1."""
-    from sklearn.decomposition import PCA
-
-    known, flat = (np.asarray(one, np.float32).reshape(len(one), -1) / 255 for one in (fitted, images))
     with np.errstate(invalid="ignore"):  # a single image has no variance
-        pca = PCA(component_count(len(fitted)), random_state=0).fit(known)
-    again = pca.inverse_transform(pca.transform(flat)).astype(np.float32)
+        pca = PCA(component_count(len(fitted)), random_state=0).fit(flat_pixels(fitted))
+    again = pca.inverse_transform(pca.transform(flat_pixels(images))).astype(np.float32)
     return torch.from_numpy(again).clamp(0, 1).reshape(images.shape)
 
 
