@@ -39,15 +39,7 @@ from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import FeatureSource, check_lengths, chosen_labels, prepare
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import (
-    Column,
-    Row,
-    Scores,
-    ScoreTable,
-    scored_table,
-    verdict,
-    verdict_table,
-)
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, judged_tables, verdict
 from derender.features import missing
 
 
@@ -87,8 +79,7 @@ def cluster(
         ready.features, ready.labels, controls=ready.controls, method=method, n_clusters=clusters,
         resample_count=how.resamples, seed=how.seed, memory=how.memory,
     )  # fmt: skip
-    caption = "Above the strongest control? (paired resamples of the rows)"
-    tables = [clustering_table(result), verdict_table(result.rows, CLUSTER_COLUMNS, caption)]
+    tables = clustering_tables(result, "Above the strongest control? (paired resamples of the rows)")
     levels = {}
     if method == "finch" and len(names) == 1:
         for row in rows:
@@ -230,8 +221,8 @@ def _scorer(
     return scores
 
 
-def clustering_table(result: ClusterComparison) -> ScoreTable:
-    """One row for each feature and control, every score."""
+def clustering_tables(result: ClusterComparison, asked: str) -> list[ScoreTable]:
+    """One row for each feature and control, every score; and the verdicts, captioned ``asked``."""
     (name, classes), *others = result.labels.items()
     what = f"mean of {len(result.labels)} labels" if others else f"{classes} classes of {name}"
     caption = f"{METHODS[result.method]}: {result.n_rows:,} rows, {what}"
@@ -239,7 +230,7 @@ def clustering_table(result: ClusterComparison) -> ScoreTable:
         caption += f"; {result.n_dropped:,} rows without label left out"
     if result.n_missing:
         caption += f"; {result.n_missing:,} single labels unknown"
-    return scored_table(caption, "features", result.rows, CLUSTER_COLUMNS)
+    return judged_tables(caption, "features", result.rows, CLUSTER_COLUMNS, asked)
 
 
 @dataclass(frozen=True)

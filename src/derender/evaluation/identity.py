@@ -27,7 +27,7 @@ from derender.evaluation.feature_rows import FeatureSource, is_model, prepare
 from derender.evaluation.image_scores import LIGHT_BINS_DEG, binned_rows
 from derender.evaluation.neighbours import unit_rows
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import Column, Scores, scored_table, verdict, verdict_table
+from derender.evaluation.score_table import Column, Scores, judged_tables, verdict
 from derender.features import FeatureTable, missing
 from derender.inputs import as_model
 from derender.storage.bounded import first_line, read_text
@@ -101,10 +101,8 @@ def identify(
         f"Identification: {len(probe):,} probes of {len(set(who[probe]))} people, gallery of "
         f"{int(shown.sum())}, nearest by cosine{' less the mean of the gallery' if centred else ''}"
     )
-    tables = [
-        scored_table(caption, "features", scored, columns, deviations=()),
-        verdict_table(scored, columns, "Above the strongest control? (people are resampled together)"),
-    ]
+    asked = "Above the strongest control? (people are resampled together)"
+    tables = judged_tables(caption, "features", scored, columns, asked, deviations=())
     values = {
         "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
         "probes": probes, "centred": centred,
@@ -262,17 +260,16 @@ def verify(
         f"Verification: {n_same:,} pairs of one person, {len(pairs) - n_same:,} of two, {n_folds} folds, "
         "threshold and mean from the other folds"
     )
-    shown = scored_table(
-        caption, "features", scored, columns, intervals=tuple(columns), deviations=(),
-        more={error: lambda row: errors.get(row.name)},
-    )  # fmt: skip
-    judged = verdict_table(scored, columns, "Above the strongest control? (paired resamples of pairs)")
+    asked = "Above the strongest control? (paired resamples of pairs)"
+    more = {error: lambda row: errors.get(row.name)}
+    every: dict[str, Any] = {"intervals": tuple(columns), "deviations": (), "more": more}
+    tables = judged_tables(caption, "features", scored, columns, asked, **every)
     values = {
         "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
         "rows": numbers_of(scored),
     }  # fmt: skip
     notes = [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()]
-    return Scores([shown, judged], values, notes, scored)
+    return Scores(tables, values, notes, scored)
 
 
 def _in_half(pairs: Pairs, half: str) -> Pairs:

@@ -62,7 +62,7 @@ from derender.evaluation.linear_probes import (
 from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, mean_precision, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table, verdict_table
+from derender.evaluation.score_table import Column, Scores, ScoreTable, judged_tables
 from derender.features import model_fingerprint, named
 from derender.inputs import Progress, device_named
 from derender.model import Derenderer
@@ -209,21 +209,19 @@ def compare_prepared(
     if supervised:
         size, device = next(iter(trained.values()))[0].image_size, device_named(options.device)
         trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device) for seed in seeds]
-    tuned = {
-        name: {
-            count: np.stack([learned(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
-            for count in split.train
-        }
-        for name, runs in trained.items()
-    }
+    tuned: dict[str, dict[int, np.ndarray]] = {name: {} for name in trained}
+    for name, runs in trained.items():
+        for count in split.train:
+            each = [learned(runs[at % len(runs)], count, at, name) for at in range(len(seeds))]
+            tuned[name][count] = np.stack(each)
+    again: dict[str, Any] = {"settings": settings, "memory": options.memory}
     for name in ready.controls if models else ():
         if not name.startswith(UNTRAINED):  # no encoder to train: the answers of the head alone
-            arrays, how = ready.features[name], (split.test, seeds, settings, options.memory)
-            tuned[name] = {n: probe_runs("linear", arrays, task, own, *how) for n, own in split.train.items()}
+            alone = partial(probe_runs, "linear", ready.features[name], task, **again)
+            tuned[name] = {count: alone(own, split.test, seeds) for count, own in split.train.items()}
     return compare_linear(
         ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
-        settings=settings, resample_count=options.resamples, memory=options.memory,
-        progress=options.stage("probing", "probes"),
+        resample_count=options.resamples, progress=options.stage("probing", "probes"), **again,
     )  # fmt: skip
 
 
@@ -262,6 +260,7 @@ def compare_linear(
         scores["average_precision"] = constant(precisions, resample_count)
         return ScoredRow(name, name in {*controls, "majority"}, len(answers), scores)
 
+    again: dict[str, Any] = {"settings": settings, "memory": memory}
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
     for head in (*heads, *([FINETUNED] if finetuned else [])):
         for count, own in rows.train.items():
@@ -269,7 +268,7 @@ def compare_linear(
             if head == FINETUNED:
                 answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
             for name, arrays in features.items() if head != FINETUNED else ():
-                answers[name] = probe_runs(head, arrays, task, own, rows.test, seeds, settings, memory)
+                answers[name] = probe_runs(head, arrays, task, own, rows.test, seeds, **again)
                 done += 1
                 if progress is not None:
                     progress(done, total)
@@ -290,8 +289,7 @@ def linear_tables(result: LinearComparison) -> list[ScoreTable]:
         rows = f"{part.count:,} labelled rows"
         caption = f"{rows}, {PROBE_NAMES[part.head]}: {asked}"
         judged = f"{rows}, {part.head}: above the strongest control?"
-        tables.append(scored_table(caption, "features", part.rows, LINEAR_COLUMNS))
-        tables.append(verdict_table(part.rows, LINEAR_COLUMNS, judged))
+        tables += judged_tables(caption, "features", part.rows, LINEAR_COLUMNS, judged)
     return tables
 
 

@@ -32,7 +32,7 @@ from derender.evaluation.feature_rows import (
     embedded_table,
     prepare,
 )
-from derender.evaluation.linear_probes import PAPER_HEAD, PROBES, majority_answers, probe_runs
+from derender.evaluation.linear_probes import PROBES, majority_answers, probe_runs
 from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
@@ -310,7 +310,7 @@ def compare_robustness(
         answers = known.setdefault(curve.learn.tobytes(), {})
         if not answers:
             for name, arrays in features.items():
-                answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
+                answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, memory=memory)
                 if progress is not None:
                     progress(sum(map(len, known.values())), total)
         both = {**answers, "majority": majority_answers(task, draws, len(tested))}
