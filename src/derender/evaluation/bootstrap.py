@@ -97,9 +97,13 @@ def once_and_resampled(groups: np.ndarray | int, count: int = RESAMPLES, seed: i
 
     Rows of one of the (N,) ``groups`` are drawn together; a number of rows has no groups.
     """
-    group = np.unique(np.arange(groups) if isinstance(groups, int) else groups, return_inverse=True)[1]
-    drawn = np.concatenate(list(resamples(int(group.max()) + 1, count, seed)))[:, group]
-    return np.concatenate((np.ones_like(drawn[:1]), drawn))
+    if isinstance(groups, int):
+        units, unit_of = groups, slice(None)
+    else:
+        names, unit_of = np.unique(groups, return_inverse=True)
+        units = len(names)
+    drawn = [np.ones((1, units), np.float32), *resamples(units, count, seed)]
+    return np.concatenate(drawn)[:, unit_of]
 
 
 def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: float = np.inf) -> Estimate:
@@ -120,7 +124,7 @@ def constant(runs: float | Runs, count: int = RESAMPLES) -> Estimate:
     return Estimate(value, NAN, NAN, _deviation(np.atleast_1d(runs)), np.full(count, value))
 
 
-def scored_row(name: str, control: bool, scores: Sequence[str], values: np.ndarray, **how: Any) -> ScoredRow:
+def scored_row(name: str, control: bool, scores: Iterable[str], values: np.ndarray, **how: Any) -> ScoredRow:
     """A row of (runs, 1 + B, scores) values by ``once_and_resampled``; ``how`` is that of ``estimate``."""
     columns = zip(scores, values[:, 0].T, values[:, 1:].mean(axis=0).T, strict=True)
     own = {score: estimate(runs, resampled, **how) for score, runs, resampled in columns}

@@ -16,15 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    constant,
-    numbers_of,
-    resamples,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
@@ -105,7 +97,7 @@ class ClusterComparison:
     ``n_missing`` single labels are unknown among the others. ``per_label`` has the scores of each first run.
     """
 
-    rows: tuple[ScoredRow, ...]
+    rows: tuple[bootstrap.ScoredRow, ...]
     method: str
     labels: Mapping[str, int]
     n_rows: int
@@ -115,7 +107,7 @@ class ClusterComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        return {**vars(self), "rows": numbers_of(self.rows)}
+        return {**vars(self), "rows": bootstrap.numbers_of(self.rows)}
 
 
 def compare_clusterings(
@@ -125,7 +117,7 @@ def compare_clusterings(
     controls: Collection[str] = (),
     method: str = "ward",
     n_clusters: int | None = None,
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     seed: int = 0,
     memory: Memory | None = None,
 ) -> ClusterComparison:
@@ -157,26 +149,25 @@ def compare_clusterings(
 
     scorers = {name: [_scorer(numbers, run) for run in own] for name, own in runs.items()}
     drawn: dict[str, list[np.ndarray]] = {name: [] for name in runs}
-    for weights in chain([once], resamples(n_rows, resample_count, seed)):
+    for weights in chain([once], bootstrap.resamples(n_rows, resample_count, seed)):
         for name, own in scorers.items():
             drawn[name].append(np.stack([score(weights) for score in own]))
     rows, per_label = [], {}
     for name, parts in drawn.items():
         values = np.concatenate(parts, axis=1)  # (runs, 1 + resamples, labels, scores)
         quiet = {*controls, "majority"}
-        rows.append(
-            scored_row(name, name in quiet, tuple(METRICS), values.mean(axis=2), centred=True, most=1.0)
-        )
+        mean = values.mean(axis=2)
+        rows.append(bootstrap.scored_row(name, name in quiet, METRICS, mean, centred=True, most=1.0))
         first_run = zip(labels, values[0, 0].tolist(), strict=True)
         per_label[name] = {label: dict(zip(METRICS, own, strict=True)) for label, own in first_run}
     orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
     deals = [_scorer(numbers, {label: own[order] for label, own in first.items()}) for order in orders]
     chance = np.stack([deal(once)[0].mean(axis=0) for deal in deals], axis=1)
-    result = {score: constant(own, resample_count) for score, own in zip(METRICS, chance, strict=True)}
-    rows.append(ScoredRow("chance", True, len(deals), result))
+    same = [bootstrap.constant(own, resample_count) for own in chance]
+    rows.append(bootstrap.ScoredRow("chance", True, len(deals), dict(zip(METRICS, same, strict=True))))
     n_missing = sum(int((values < 0).sum()) for values in numbers.values())
-    dropped = int((~labelled).sum())
-    return ClusterComparison(with_verdicts(rows), method, sizes, n_rows, dropped, n_missing, per_label)
+    judged, dropped = bootstrap.with_verdicts(rows), int((~labelled).sum())
+    return ClusterComparison(judged, method, sizes, n_rows, dropped, n_missing, per_label)
 
 
 def _numbered(values: np.ndarray, name: str) -> np.ndarray:

@@ -13,14 +13,7 @@ from typing import Any
 import numpy as np
 
 from derender.data.layouts.layout import in_test_half, stem_of
-from derender.evaluation.bootstrap import (
-    ScoredRow,
-    constant,
-    estimate,
-    numbers_of,
-    once_and_resampled,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import FeatureSource, is_model, prepare
@@ -93,7 +86,8 @@ def identify(
             controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
         ).rows  # fmt: skip
         ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in result}
-        scored = with_verdicts([replace(row, scores={**row.scores, **ward[row.name]}) for row in scored])
+        both = [replace(row, scores={**row.scores, **ward[row.name]}) for row in scored]
+        scored = bootstrap.with_verdicts(both)
         note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
         columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
@@ -106,7 +100,7 @@ def identify(
     values = {
         "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
         "probes": probes, "centred": centred,
-        "rows": numbers_of(scored),
+        "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
     return Scores(tables, values, [*how.notes, verdict(scored[0], "all"), how.memory.summary()], scored)
 
@@ -235,21 +229,21 @@ def verify(
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
-    weights = once_and_resampled(len(pairs), how.resamples, how.seed)
+    weights = bootstrap.once_and_resampled(len(pairs), how.resamples, how.seed)
     scored, errors = [], {}
     for row in rows:
         runs = [_judged(run, sides, pairs) for run in row.arrays()]
         right = np.mean([own for own, _ in runs], axis=0)
         accuracy = weights @ right / weights.sum(axis=1)
         areas = np.stack([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs])
-        scores = {"accuracy": estimate(accuracy[:1], accuracy[1:])}
-        scores["auc"] = estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
+        scores = {"accuracy": bootstrap.estimate(accuracy[:1], accuracy[1:])}
+        scores["auc"] = bootstrap.estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
         each = [float(right[pairs.fold == fold].mean()) for fold in np.unique(pairs.fold)]
         errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
-        scored.append(ScoredRow(row.name, row.control, len(runs), scores))
-    half_right = constant(0.5, how.resamples)
-    scored.append(ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
-    scored = with_verdicts(scored)
+        scored.append(bootstrap.ScoredRow(row.name, row.control, len(runs), scores))
+    half_right = bootstrap.constant(0.5, how.resamples)
+    scored.append(bootstrap.ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
+    scored = bootstrap.with_verdicts(scored)
     columns = {
         "accuracy": Column("accuracy", "high", note="share of pairs judged right, mean over folds"),
         "auc": Column("AUC", "high", note="area under the ROC curve over all pairs"),
@@ -266,7 +260,7 @@ def verify(
     tables = judged_tables(caption, "features", scored, columns, asked, **every)
     values = {
         "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
-        "rows": numbers_of(scored),
+        "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
     notes = [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()]
     return Scores(tables, values, notes, scored)

@@ -29,15 +29,7 @@ from torch import nn
 from derender.baselines.controls import untrained_twin
 from derender.baselines.supervised import fresh_resnet18
 from derender.data import as_float
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    constant,
-    estimate,
-    numbers_of,
-    once_and_resampled,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.controls import UNTRAINED, subject_and_controls
 from derender.evaluation.feature_rows import (
     FeatureSource,
@@ -143,7 +135,11 @@ class LinearPart:
 
     head: str
     count: int
-    rows: tuple[ScoredRow, ...]
+    rows: tuple[bootstrap.ScoredRow, ...]
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything as JSON takes it."""
+        return {"head": self.head, "labels": self.count, "rows": bootstrap.numbers_of(self.rows)}
 
 
 @dataclass(frozen=True)
@@ -163,10 +159,7 @@ class LinearComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        parts = [
-            {"head": part.head, "labels": part.count, "rows": numbers_of(part.rows)} for part in self.parts
-        ]
-        return {**vars(self), "parts": parts}
+        return {**vars(self), "parts": [part.numbers() for part in self.parts]}
 
 
 def compare_prepared(
@@ -235,7 +228,7 @@ def compare_linear(
     heads: Sequence[str] = HEADS,
     finetuned: Mapping[str, Mapping[int, np.ndarray]] | None = None,
     settings: HeadSettings = PAPER_HEAD,
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> LinearComparison:
@@ -248,17 +241,17 @@ def compare_linear(
     """
     check_lengths(features, len(task))
     truth = task.targets[rows.test]
-    weights = once_and_resampled(len(rows.test), resample_count)
+    weights = bootstrap.once_and_resampled(len(rows.test), resample_count)
 
-    def scored(name: str, answers: np.ndarray) -> ScoredRow:
+    def scored(name: str, answers: np.ndarray) -> bootstrap.ScoredRow:
         """Scores of (S, T, A) answers; average precision has no interval."""
         counted = np.stack([count_scores(truth, answer, task.kind, weights) for answer in answers])
         plain, drawn = counted[:, 0].astype(np.float64), counted[:, 1:].mean(axis=0)
         both = enumerate(("accuracy", "balanced_accuracy"))
-        scores = {score: estimate(plain[:, at], drawn[:, at]) for at, score in both}
+        scores = {score: bootstrap.estimate(plain[:, at], drawn[:, at]) for at, score in both}
         precisions = [mean_precision(truth, answer) for answer in answers]
-        scores["average_precision"] = constant(precisions, resample_count)
-        return ScoredRow(name, name in {*controls, "majority"}, len(answers), scores)
+        scores["average_precision"] = bootstrap.constant(precisions, resample_count)
+        return bootstrap.ScoredRow(name, name in {*controls, "majority"}, len(answers), scores)
 
     again: dict[str, Any] = {"settings": settings, "memory": memory}
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
@@ -273,7 +266,8 @@ def compare_linear(
                 if progress is not None:
                     progress(done, total)
             answers["majority"] = majority_answers(task, own, len(truth))
-            parts.append(LinearPart(head, count, with_verdicts([*map(scored, answers, answers.values())])))
+            judged = bootstrap.with_verdicts([*map(scored, answers, answers.values())])
+            parts.append(LinearPart(head, count, judged))
     dropped = int((~task.known).sum())
     return LinearComparison(tuple(parts), task.kind, task.names, len(rows.test), dropped, tuple(seeds))
 
@@ -317,12 +311,9 @@ def finetune(
 
     def embed(numbers: np.ndarray) -> torch.Tensor:
         pictures = as_float(np.ascontiguousarray(images[numbers])).to(device)
-        parts = (
-            [net.encoder(pictures) for net in nets.values()]
-            if ours
-            else nets["whole"].embed(pictures).values()
-        )
-        return torch.cat([*parts], dim=1)
+        if ours:
+            return torch.cat([net.encoder(pictures) for net in nets.values()], dim=1)
+        return torch.cat([*nets["whole"].embed(pictures).values()], dim=1)
 
     generator = torch.Generator().manual_seed(seed)
     targets = torch.from_numpy(task.targets).float().to(device)

@@ -144,10 +144,9 @@ def ground_truth_scores(
     if dimensions is not None:
         weights, each = importance(everything, factors), binned(everything)
         single = np.stack([_explained(everything, factor) for factor in factors], axis=1)
-        gaps = [_information_gap(each, factor) for factor in factors], _gap(single)
-        by_dimension = ModularityScores(
-            *dci(weights), informativeness, *(float(np.mean(one)) for one in gaps)
-        )
+        own_mig = float(np.mean([_information_gap(each, factor) for factor in factors]))
+        sap = float(np.mean(_gap(single)))
+        by_dimension = ModularityScores(*dci(weights), informativeness, own_mig, sap)
     return GroundTruthScores(
         names,
         tuple(factor.name for factor in factors),

@@ -15,14 +15,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    numbers_of,
-    once_and_resampled,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.controls import control_rows
 from derender.evaluation.feature_rows import (
     FeatureRow,
@@ -179,9 +172,9 @@ class CurveResult:
     title: str
     levels: tuple[float, ...]
     n_tested: tuple[int, ...]
-    rows: Mapping[str, tuple[ScoredRow, ...]]
+    rows: Mapping[str, tuple[bootstrap.ScoredRow, ...]]
 
-    def values(self, row: ScoredRow) -> list[float]:
+    def values(self, row: bootstrap.ScoredRow) -> list[float]:
         """The curve itself: one score for each angle."""
         return [row.scores[level_name(level)].value for level in self.levels]
 
@@ -208,7 +201,8 @@ class RobustnessComparison:
         curves = {}
         for curve in self.curves:
             facts = {"title": curve.title, "levels_deg": curve.levels, "n_tested": curve.n_tested}
-            curves[curve.name] = facts | {score: numbers_of(rows) for score, rows in curve.rows.items()}
+            scores = {score: bootstrap.numbers_of(rows) for score, rows in curve.rows.items()}
+            curves[curve.name] = facts | scores
         return {**vars(self), "curves": curves}
 
     def tables(self, score: str = "accuracy") -> list[ScoreTable]:
@@ -260,7 +254,7 @@ def compare_robustness(
     *,
     controls: Collection[str] = (),
     head: str = "logistic",
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     seed: int = 0,
     memory: Memory | None = None,
     progress: Progress | None = None,
@@ -278,14 +272,14 @@ def compare_robustness(
         raise ValueError("a comparison needs one array of features in each row, and a seed")
     tested = np.unique(np.concatenate([rows for curve in trial.curves for rows in curve.points]))
 
-    def scored(curve: Curve, answers: Mapping[str, np.ndarray]) -> dict[str, tuple[ScoredRow, ...]]:
+    def scored(curve: Curve, answers: Mapping[str, np.ndarray]) -> dict[str, tuple[bootstrap.ScoredRow, ...]]:
         """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
         truths = [task.targets[rows] for rows in curve.points]
         places = [np.searchsorted(tested, rows) for rows in curve.points]
         units = [trial.unit[rows] for rows in curve.points]
         draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
         starts = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
-        weights = list(map(once_and_resampled, units, repeat(resample_count), starts))
+        weights = list(map(bootstrap.once_and_resampled, units, repeat(resample_count), starts))
         names = (ORDINARY, AREA, *map(level_name, curve.levels))
 
         def scores(run: np.ndarray) -> np.ndarray:
@@ -295,12 +289,12 @@ def compare_robustness(
             area = area_under(curve.levels, np.stack(levels, axis=-1))
             return np.stack((ordinary, area, *levels), axis=1)
 
-        result: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
+        result: dict[str, list[bootstrap.ScoredRow]] = {score: [] for score in SCORES}
         for name, runs in answers.items():
             both = np.stack([scores(run) for run in runs])
             for at, rows in enumerate(result.values()):
-                rows.append(scored_row(name, name in {*controls, "majority"}, names, both[..., at]))
-        return {score: with_verdicts(rows) for score, rows in result.items()}
+                rows.append(bootstrap.scored_row(name, name in {*controls, "majority"}, names, both[..., at]))
+        return {score: bootstrap.with_verdicts(rows) for score, rows in result.items()}
 
     known: dict[bytes, dict[str, np.ndarray]] = {}  # answers by training rows: most curves share these
     total, curves, n_learned = len({one.learn.tobytes() for one in trial.curves}) * len(features), [], {}

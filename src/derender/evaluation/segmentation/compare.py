@@ -197,7 +197,7 @@ def segment(
         result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
         iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
         losses = np.array([run["losses"] for run in runs if trainable])
-        scored = scored_row(title, control, tuple(COLUMNS), result)
+        scored = scored_row(title, control, COLUMNS, result)
         return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
     rows = []
