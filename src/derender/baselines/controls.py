@@ -24,6 +24,8 @@ from derender.storage.places import optional
 
 ORIENTATIONS, BLOCK_CELLS, CELL_PX = 9, 2, 8
 BLUR_PX = 0.75
+LUMINANCE = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in brightness (ITU-R BT.601)."""
 UNIFORM_PATTERNS = 59
 
 
@@ -145,7 +147,7 @@ def descriptor_features(name: str, images: ImageSet, *, progress: Progress | Non
 
 def _luma(image: np.ndarray) -> np.ndarray:
     """Brightness 0..255 of (3, H, W)."""
-    return np.tensordot((0.299, 0.587, 0.114), image.astype(np.float64), 1)
+    return np.tensordot(LUMINANCE, image.astype(np.float64), 1)
 
 
 def untrained_twin(model: Any, seed: int) -> Any:

@@ -122,9 +122,8 @@ def linear(
     )  # fmt: skip
     tables, notes = linear_tables(result), [*how.notes, *left_out, how.memory.summary()]
     if ready.n_dropped:
-        notes.insert(
-            0, f"{ready.n_dropped:,} rows beyond {min_count} to {max_count or 'all'} rows of a class left out"
-        )
+        most = max_count or "all"
+        notes.insert(0, f"{ready.n_dropped:,} rows beyond {min_count} to {most} rows of a class left out")
         result = replace(result, n_dropped=result.n_dropped + ready.n_dropped)
     return Scores(tables, {**result.numbers(), "labels": names}, notes)
 

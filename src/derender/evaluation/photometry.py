@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from derender.baselines.controls import untrained_twin
+from derender.baselines.controls import LUMINANCE, untrained_twin
 from derender.data import ImageSet, read_ground_truth
 from derender.data.image_set import as_float
 from derender.evaluation.angles import agreement, agreement_table
@@ -40,7 +40,7 @@ from derender.photo import PhotoDetail, editable_scenes
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
-LUMA = np.array([0.299, 0.587, 0.114])
+LUMA = np.array(LUMINANCE)
 _LIGHT = Column("light r", None, note="correlation of mean shading with true brightness of albedo, best 0")
 _CHROMA = Column("chroma error", "low", 4, "distance of mean colours divided by their sums, best 0")
 _SHARE = Column("share", None, note="of the groups' difference in brightness that albedo takes, best 1")

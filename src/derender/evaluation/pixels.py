@@ -24,7 +24,7 @@ from derender.evaluation.image_scores import ImageResult, means_and_each
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 
-COMPONENTS = 64
+COMPONENTS, COMPONENT_IMAGES = 64, 2_000
 WINDOW = 11
 
 
@@ -140,6 +140,11 @@ def evaluate_reconstruction(
 def component_count(images: int, most: int = COMPONENTS) -> int:
     """Number of principal components from so many images: at most a quarter of their number."""
     return max(1, min(most, images // 4))
+
+
+def evenly(count: int, most: int = COMPONENT_IMAGES) -> np.ndarray:
+    """At most so many of ``count`` row numbers, evenly apart."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:

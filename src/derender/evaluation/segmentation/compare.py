@@ -20,6 +20,7 @@ from derender.data import read_masks
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, once_and_resampled, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
+from derender.evaluation.pixels import evenly
 from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmentation import nets
 from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
@@ -174,7 +175,7 @@ def segment(
     check_size(model, data.images)
     settings, memory = settings or SegmentSettings(), memory or Memory()
     settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
-    shown = data.test[np.linspace(0, len(data.test) - 1, min(SHOWN, len(data.test))).astype(int)]
+    shown = data.test[evenly(len(data.test), SHOWN)]
     content = content_hash({name: getattr(data, name) for name in ("images", "masks", "train", "test")})
     same = {"data": content, "classes": len(data.classes)}
     each = settings.epochs * len(data.train)

@@ -13,10 +13,9 @@ from sklearn.decomposition import PCA
 
 from derender.baselines.controls import flat_pixels
 from derender.data import ImageSet, split_indices
-from derender.evaluation.pixels import component_count
+from derender.evaluation.pixels import component_count, evenly
 
 TEST_FRACTION = 0.2
-COMPONENT_IMAGES = 2_000
 _CHUNK = 512
 
 
@@ -110,8 +109,7 @@ def by_components(data: SegmentationData) -> np.ndarray:
         codes = [pca.transform(flat_pixels(data.images[part])) for part in parts]
         return np.column_stack((np.ones(len(rows)), np.concatenate(codes)))
 
-    places = np.linspace(0, len(data.train) - 1, min(len(data.train), COMPONENT_IMAGES)).astype(int)
-    fitted = flat_pixels(data.images[data.train[places]])
+    fitted = flat_pixels(data.images[data.train[evenly(len(data.train))]])
     pca = PCA(component_count(len(data.train)), random_state=0).fit(fitted)
     learned = data.masks[data.train].reshape(len(data.train), -1)
     solver, tested = np.linalg.pinv(described(data.train)), described(data.test)
