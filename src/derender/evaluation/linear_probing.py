@@ -29,28 +29,9 @@ from torch import nn
 from derender.baselines.controls import untrained_twin
 from derender.baselines.supervised import fresh_resnet18
 from derender.data import as_float
-from derender.evaluation import bootstrap
+from derender.evaluation import bootstrap, feature_rows
+from derender.evaluation import linear_probes as probes
 from derender.evaluation.controls import UNTRAINED, subject_and_controls
-from derender.evaluation.feature_rows import (
-    FeatureSource,
-    ModelSource,
-    Prepared,
-    check_lengths,
-    chosen_labels,
-    is_model,
-    opened,
-    prepare,
-)
-from derender.evaluation.linear_probes import (
-    HEADS,
-    PAPER_HEAD,
-    PROBES,
-    HeadSettings,
-    head_loss,
-    majority_answers,
-    probabilities,
-    probe_runs,
-)
 from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, mean_precision, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
@@ -65,16 +46,16 @@ LINEAR_COLUMNS = {
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
 FINETUNED, SUPERVISED = "fine-tuned", "ResNet-18, supervised"
-PROBE_NAMES = {**PROBES, FINETUNED: "the paper's head, encoders trained too"}
+PROBE_NAMES = {**probes.PROBES, FINETUNED: "the paper's head, encoders trained too"}
 
 
 def linear(
-    features: FeatureSource,
+    features: feature_rows.FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
     attributes: bool = False,
     counts: Sequence[int] = (100, 500, 1_000),
-    heads: Sequence[str] = HEADS,
+    heads: Sequence[str] = probes.HEADS,
     seeds: int = 5,
     test_fraction: float = 0.5,
     groups: str | None = None,
@@ -108,16 +89,16 @@ def linear(
     heads = (heads,) if isinstance(heads, str) else heads
     counts = (counts,) if isinstance(counts, int) else counts
     for head in heads:
-        named(PROBES, head, "head")
-    if finetune and not is_model(features):
+        named(probes.PROBES, head, "head")
+    if finetune and not feature_rows.is_model(features):
         raise ValueError("finetune trains the encoders: give a model and images")
     how = Options(untrained_seeds=untrained_seeds, **options)
     rows = subject_and_controls(features, how)
-    names, left_out = chosen_labels(rows[0].tables[0], label, attributes, least=2)
-    ready = prepare(rows, names, min_count=min_count, max_count=max_count)
+    names, left_out = feature_rows.chosen_labels(rows[0].tables[0], label, attributes, least=2)
+    ready = feature_rows.prepare(rows, names, min_count=min_count, max_count=max_count)
     result = compare_prepared(
-        ready, counts, how.seeds(seeds), how, heads=heads, settings=HeadSettings(epochs=epochs),
-        models={rows[0].name: [features]} if finetune and is_model(features) else {},
+        ready, counts, how.seeds(seeds), how, heads=heads, settings=probes.HeadSettings(epochs=epochs),
+        models={rows[0].name: [features]} if finetune and feature_rows.is_model(features) else {},
         test_fraction=test_fraction, groups=ready.table.label(groups) if groups else None,
     )  # fmt: skip
     tables, notes = linear_tables(result), [*how.notes, *left_out, how.memory.summary()]
@@ -162,14 +143,14 @@ class LinearComparison:
 
 
 def compare_prepared(
-    ready: Prepared,
+    ready: feature_rows.Prepared,
     counts: Sequence[int],
     seeds: Sequence[int],
     options: Options,
     *,
-    heads: Sequence[str] = HEADS,
-    settings: HeadSettings = PAPER_HEAD,
-    models: Mapping[str, Sequence[ModelSource]] | None = None,
+    heads: Sequence[str] = probes.HEADS,
+    settings: probes.HeadSettings = probes.PAPER_HEAD,
+    models: Mapping[str, Sequence[feature_rows.ModelSource]] | None = None,
     supervised: bool = False,
     **rows: Any,
 ) -> LinearComparison:
@@ -195,7 +176,8 @@ def compare_prepared(
         learn = partial(finetune, model, images, task, training, split.test, factors=chosen, **how)
         return options.memory.recall_one("finetuned", inputs, learn)
 
-    trained = {name: [opened(run, options.device) for run in runs] for name, runs in (models or {}).items()}
+    opened = partial(feature_rows.opened, device=options.device)
+    trained = {name: list(map(opened, runs)) for name, runs in (models or {}).items()}
     if ours := [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]:
         trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
     if supervised:
@@ -209,7 +191,7 @@ def compare_prepared(
     again: dict[str, Any] = {"settings": settings, "memory": options.memory}
     for name in ready.controls if models else ():
         if not name.startswith(UNTRAINED):  # no encoder to train: the answers of the head alone
-            alone = partial(probe_runs, "linear", ready.features[name], task, **again)
+            alone = partial(probes.probe_runs, "linear", ready.features[name], task, **again)
             tuned[name] = {count: alone(own, split.test, seeds) for count, own in split.train.items()}
     return compare_linear(
         ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
@@ -224,9 +206,9 @@ def compare_linear(
     seeds: Sequence[int],
     *,
     controls: Collection[str] = (),
-    heads: Sequence[str] = HEADS,
+    heads: Sequence[str] = probes.HEADS,
     finetuned: Mapping[str, Mapping[int, np.ndarray]] | None = None,
-    settings: HeadSettings = PAPER_HEAD,
+    settings: probes.HeadSettings = probes.PAPER_HEAD,
     resample_count: int = bootstrap.RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
@@ -238,7 +220,7 @@ def compare_linear(
     nothing. ``finetuned``, by name and number of labels (S, T, A) answers of fine-tuned models, are a further
     head. ``progress`` is called with (probes done, probes in all).
     """
-    check_lengths(features, len(task))
+    feature_rows.check_lengths(features, len(task))
     truth = task.targets[rows.test]
     weights = bootstrap.once_and_resampled(len(rows.test), resample_count)
 
@@ -260,11 +242,11 @@ def compare_linear(
             if head == FINETUNED:
                 answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
             for name, arrays in features.items() if head != FINETUNED else ():
-                answers[name] = probe_runs(head, arrays, task, own, rows.test, seeds, **again)
+                answers[name] = probes.probe_runs(head, arrays, task, own, rows.test, seeds, **again)
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            answers["majority"] = majority_answers(task, own, len(truth))
+            answers["majority"] = probes.majority_answers(task, own, len(truth))
             judged = bootstrap.with_verdicts([*map(scored, answers, answers.values())])
             parts.append(LinearPart(head, count, judged))
     dropped = int((~task.known).sum())
@@ -295,7 +277,7 @@ def finetune(
     *,
     factors: Sequence[str] = ("geometry", "albedo"),
     seed: int = 0,
-    settings: HeadSettings = PAPER_HEAD,
+    settings: probes.HeadSettings = probes.PAPER_HEAD,
     progress: Progress | None = None,
 ) -> np.ndarray:
     """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
@@ -327,7 +309,7 @@ def finetune(
         order = torch.from_numpy(rows)[torch.randperm(len(rows), generator=generator)]
         for batch in order.split(settings.batch_size):
             logits, asked = head(embed(batch.numpy())), targets[batch.to(device)]
-            loss = head_loss(logits[None], asked[None], task.kind).sum()
+            loss = probes.head_loss(logits[None], asked[None], task.kind).sum()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
@@ -336,4 +318,5 @@ def finetune(
     nets.eval()
     with torch.inference_mode():
         parts = np.array_split(tested, max(1, len(tested) // 256))
-        return np.concatenate([probabilities(head(embed(part)), task.kind).cpu().numpy() for part in parts])
+        answers = (probes.probabilities(head(embed(part)), task.kind) for part in parts)
+        return np.concatenate([answer.cpu().numpy() for answer in answers])

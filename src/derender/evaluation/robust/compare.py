@@ -15,16 +15,8 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
-from derender.evaluation import bootstrap
+from derender.evaluation import bootstrap, feature_rows
 from derender.evaluation.controls import control_rows
-from derender.evaluation.feature_rows import (
-    FeatureRow,
-    ModelSource,
-    check_lengths,
-    chosen_labels,
-    embedded_table,
-    prepare,
-)
 from derender.evaluation.linear_probes import PROBES, majority_answers, probe_runs
 from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
@@ -54,7 +46,7 @@ _LOST = Column("lost", None, note="ordinary less area; read it beside ordinary, 
 
 
 def robustness(
-    models: Mapping[str, ModelSource] | ModelSource,
+    models: Mapping[str, feature_rows.ModelSource] | feature_rows.ModelSource,
     images: ImageSet | str | Path | None = None,
     *,
     pictures: str | None = None,
@@ -123,10 +115,10 @@ def robustness(
         columns = FeatureTable(read.files, {"none": np.zeros((len(read), 1))}, table_labels(read))
         if not names and not attributes:
             names = [name for name in ("identity", "class") if name in columns.labels][:1]
-        chosen, left_out = chosen_labels(columns, names, attributes, 2)
+        chosen, left_out = feature_rows.chosen_labels(columns, names, attributes, 2)
         how.notes.extend(left_out)
         sizes = {"min_count": min_count, "max_count": max_count}
-        ready = prepare([FeatureRow("images", (columns,))], chosen, **sizes)
+        ready = feature_rows.prepare([feature_rows.FeatureRow("images", (columns,))], chosen, **sizes)
         side = ready.table.label(groups) if groups else None
         read, task = how.at(first.image_size, ready.table.files), task_of(ready.labels)
         if way == "truth":
@@ -139,12 +131,12 @@ def robustness(
             )
     rows = []
     for name, net in nets.items():
-        table = embedded_table(net, trial.pictures, how.memory, how.stage(f"embedding {name}"))
+        table = feature_rows.embedded_table(net, trial.pictures, how.memory, how.stage(f"embedding {name}"))
         joined, prefix = " + ".join(how.chosen or table.factors), f"{name}: " if len(nets) > 1 else ""
-        rows.append(FeatureRow(f"{prefix}{joined}", (table,), how.chosen))
+        rows.append(feature_rows.FeatureRow(f"{prefix}{joined}", (table,), how.chosen))
         if len(rows) == 1:
             single = [one for one in table.factors if one != joined]
-            rows += [FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
+            rows += [feature_rows.FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
     learned_from = np.unique(np.concatenate([curve.learn for curve in trial.curves]))
     fit_on = trial.pictures.select(learned_from)
     rows += control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
@@ -267,7 +259,7 @@ def compare_robustness(
     called with (probes done, probes in all).
     """
     task = trial.task
-    check_lengths(features, len(task))
+    feature_rows.check_lengths(features, len(task))
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
     tested = np.unique(np.concatenate([rows for curve in trial.curves for rows in curve.points]))

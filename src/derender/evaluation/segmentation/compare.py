@@ -8,7 +8,7 @@ image by image and added up before they are divided. A class that no tested mask
 mean; answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, once_and_resampl
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
 from derender.evaluation.pixels import evenly
-from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmentation import nets
 from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
 from derender.evaluation.segmentation.nets import SegmentSettings
@@ -104,10 +104,9 @@ class SegmentationComparison:
             f"{count} seed{'s' if count > 1 else ''}"
         )
         trainable = {row.scored.name: row.trainable for row in self.rows}
-        learn: Mapping[Column, Callable[[ScoredRow], Cell]] = {
-            Column("learn", note="number of trained weights"): lambda row: trainable[row.name] or None
-        }
-        tables = [scored_table(caption, "net", scored, COLUMNS, more=learn)]
+        learn = Column("learn", note="number of trained weights")
+        more = {learn: lambda row: trainable[row.name] or None}
+        tables = [scored_table(caption, "net", scored, COLUMNS, more=more)]
         if any(row.versus for row in scored):
             tables.append(verdict_table(scored, COLUMNS, "above the strongest control?"))
         learning = [row for row in self.rows if row.trainable]
