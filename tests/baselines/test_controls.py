@@ -58,10 +58,10 @@ def test_hog_knows_orientations_and_neither_brightness_nor_contrast():
     upright = np.tile(100 + 60 * np.sin(np.arange(32) / 2), (32, 1)).round()
     seen = []
     given = stripes(upright, upright.T, upright + 40, np.full((32, 32), 7))
-    table = controls.hog_features(given, progress=lambda *counts: seen.append(counts))
+    table = controls.descriptor_features("hog", given, progress=lambda *counts: seen.append(counts))
     values = table.factors["hog"]
     assert values.shape == (4, 3 * 3 * 2 * 2 * 9) and seen == [(4, 4)]
-    assert controls.hog_features(stripes(np.zeros((64, 64)))).factors["hog"].shape == (1, 1764)
+    assert controls.descriptor_features("hog", stripes(np.zeros((64, 64)))).factors["hog"].shape == (1, 1764)
     assert table.origin["control"] == "hog" and table.label("n").tolist() == [0, 1, 2, 3]
     by_orientation = values[:2].reshape(2, -1, 9).sum(axis=1)
     assert by_orientation.argmax(axis=1).tolist() == [0, 4]
@@ -73,24 +73,26 @@ def test_hog_knows_orientations_and_neither_brightness_nor_contrast():
 
 def test_bad_input_and_a_missing_package_are_named():
     with pytest.raises(ValueError, match="12x12 pixels are too few: HOG needs 16 a side"):
-        controls.hog_features(stripes(np.zeros((12, 12))))
+        controls.descriptor_features("hog", stripes(np.zeros((12, 12))))
     with pytest.raises(ValueError, match=r"the baseline x needs the package no_such.*derender\[baselines\]"):
         optional("no_such.thing", "the baseline x")
 
 
 def test_gradientfaces_are_the_same_in_brighter_light():
     shapes = np.add.outer(np.sin(np.arange(32) / 3), np.cos(np.arange(32) / 5))
-    table = controls.gradientfaces_features(stripes(*(100 + gain * shapes for gain in (25, 50, -50))))
+    table = controls.descriptor_features(
+        "gradientfaces", stripes(*(100 + gain * shapes for gain in (25, 50, -50)))
+    )
     one, brighter, inverted = table.factors["gradientfaces"]
     assert one.shape == (2 * 32 * 32,) and one @ brighter > 0.97 * 32 * 32
     assert one @ inverted < -0.97 * 32 * 32
-    ramp = controls.gradientfaces_features(stripes(np.tile(np.arange(32), (32, 1)) * 4))
+    ramp = controls.descriptor_features("gradientfaces", stripes(np.tile(np.arange(32), (32, 1)) * 4))
     np.testing.assert_allclose(ramp.factors["gradientfaces"], [[1] * 1024 + [0] * 1024], atol=1e-6)
 
 
 def test_local_binary_patterns_are_shares_in_cells():
     upright = np.tile(100 + 60 * np.sin(np.arange(32) / 2), (32, 1)).round()
-    values = controls.lbp_features(stripes(upright, upright.T, upright + 40)).factors["lbp"]
+    values = controls.descriptor_features("lbp", stripes(upright, upright.T, upright + 40)).factors["lbp"]
     assert values.shape == (3, 16 * 59)
     np.testing.assert_allclose(np.linalg.norm(values.reshape(3, 16, 59), axis=2), 1, rtol=1e-5)
     np.testing.assert_array_equal(values[0], values[2])

@@ -11,9 +11,9 @@ from sklearn.metrics import adjusted_rand_score, f1_score, normalized_mutual_inf
 from derender.baselines.controls import pixel_features
 from derender.data import read_images
 from derender.evaluation import at_least, chance_scores, cluster, cluster_scores, compare_clusterings
-from derender.evaluation.clustering import clustering_table
+from derender.evaluation.clustering import clustering_tables
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS, METRICS, metric
-from derender.evaluation.score_table import verdict, verdict_table
+from derender.evaluation.score_table import verdict
 from derender.features import FeatureTable
 
 NAMES = np.array(["ann", "bob", "cid"])
@@ -162,14 +162,13 @@ def test_tables_show_scores_intervals_and_the_strongest_control():
     column = who.astype(object)
     column[:19] = None
     result = compare(features, {"who": column})
-    table = clustering_table(result)
+    table, judged = clustering_tables(result, "above?")
     assert [one.name for one in table.columns] == ["accuracy", "95 %", "±", "F1", "NMI", "matched", "ARI"]
     assert table.caption == "Ward clustering: 71 rows, 3 classes of who; 19 rows without label left out"
     values = table.values()
     assert np.isnan(values["ours"]["±"]) and values["noise"]["±"] > 0
     assert np.isnan(values["chance"]["95 %"].low)
     assert values["noise"]["95 %"].low < values["noise"]["accuracy"] < values["noise"]["95 %"].high
-    judged = verdict_table(result.rows, CLUSTER_COLUMNS, "above?")
     assert [row.name for row in judged.rows] == [f"ours: {c.name}" for c in CLUSTER_COLUMNS.values()]
     rival = result.rows[0].versus["accuracy"].rival
     assert judged.values()["ours: accuracy"]["strongest control"] == rival
@@ -192,8 +191,8 @@ def test_a_metric_declared_once_is_scored_judged_and_shown(monkeypatch):
     features, who = problem()
     result = compare(features, {"who": who})
     assert result.rows[0].scores["rows"].value == 1 and result.rows[0].versus["rows"].above
-    assert clustering_table(result).values()["ours"]["pure rows"] == 1
-    assert "ours: pure rows" in verdict_table(result.rows, CLUSTER_COLUMNS, "above?").values()
+    table, judged = clustering_tables(result, "above?")
+    assert table.values()["ours"]["pure rows"] == 1 and "ours: pure rows" in judged.values()
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from derender.data.layouts import rendered
 from derender.data.synthetic import faces
 from derender.evaluation import brightness, light, pose, relight
 from derender.evaluation.angles import agreement, known_angles, read_columns
-from derender.evaluation.bootstrap import group_resamples
+from derender.evaluation.bootstrap import once_and_resampled
 from derender.evaluation.photometry import surfaces
 from derender.scene import Scene
 
@@ -55,13 +55,13 @@ def score(result, angle: str, row: str = "model") -> dict[str, float]:
 
 
 def test_agreement_is_that_of_numpy_also_on_resamples():
-    true, weights = RNG.standard_normal(50), group_resamples(np.arange(50), 3)
+    true, weights = RNG.standard_normal(50), once_and_resampled(50, 2)
     predicted = 0.4 * true + 2 + 0.1 * RNG.standard_normal(50)
     result = agreement(predicted, true, weights)
     assert result["r"].value == pytest.approx(np.corrcoef(predicted, true)[0, 1])
     assert result["slope"].value == pytest.approx(np.polyfit(true, predicted, 1)[0])
     assert result["offset"].value == pytest.approx((predicted - true).mean())
-    drawn = np.repeat(np.arange(50), weights[1].astype(int))
+    drawn = np.repeat(np.arange(50), weights[2].astype(int))
     expected = np.corrcoef(predicted[drawn], true[drawn])[0, 1]
     assert result["r"].resampled[1] == pytest.approx(expected)
     assert np.isnan(agreement(np.ones(50), true, weights)["r"].value)

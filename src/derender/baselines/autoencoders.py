@@ -41,9 +41,9 @@ class AutoencoderSettings(base.BaselineSettings):
     def _as_ours(cls, value: int) -> int:
         return NetworkSettings(image_size=value).image_size
 
-    def encoder(self, code_size: int | None = None) -> Encoder:
-        """A geometry encoder of this size."""
-        return Encoder(self.network, self.width, code_size or self.code_size, normalised=True)
+    def encoder(self, codes: int = 1) -> Encoder:
+        """A geometry encoder of this size, of one code or more side by side."""
+        return Encoder(self.network, self.width, codes * self.code_size, normalised=True)
 
     @property
     def network(self) -> NetworkSettings:
@@ -64,10 +64,11 @@ class Autoencoder(base.LoopModel):
     name, settings_type, config_type = "ae", AutoencoderSettings, AutoencoderConfig
     features = ("code",)
     settings: AutoencoderSettings
+    codes = 1
 
     def __init__(self, settings: AutoencoderSettings):
         super().__init__(settings)
-        self.encoder = settings.encoder()
+        self.encoder = settings.encoder(self.codes)
         self.decoder = MapDecoder(settings.network, 3)
 
     def reconstruct(self, images: base.Images) -> base.Images:
@@ -96,18 +97,16 @@ class BetaVaeConfig(AutoencoderConfig):
     objective: BetaObjective = BetaObjective()
 
 
-class BetaVae(base.LoopModel):
+class BetaVae(Autoencoder):
     """Image to a normal posterior over codes to an image. Feature: ``mean``, the posterior's mean."""
 
-    name, settings_type, config_type = "beta-vae", AutoencoderSettings, BetaVaeConfig
+    name, config_type = "beta-vae", BetaVaeConfig
     features = ("mean",)
-    settings: AutoencoderSettings
+    codes = 2  # mean and log variance
 
     def __init__(self, settings: AutoencoderSettings):
         super().__init__(settings)
-        self.encoder = settings.encoder(2 * settings.code_size)
         self.encoder.to_code = nn.Sequential(self.encoder.to_code[0])  # no ReLU: a mean has both signs
-        self.decoder = MapDecoder(settings.network, 3)
 
     def posterior(self, images: base.Images) -> tuple[Float[Tensor, "n code"], Float[Tensor, "n code"]]:
         """Mean and log variance of every number of the code."""

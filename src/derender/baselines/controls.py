@@ -8,7 +8,7 @@ patterns, square roots of their shares in cells of 8x8 pixels. Gradientfaces: Zh
 direction of the gradient, which keeps faces apart in any light.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ from derender.storage.places import optional
 
 ORIENTATIONS, BLOCK_CELLS, CELL_PX = 9, 2, 8
 BLUR_PX = 0.75
+LUMINANCE = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in brightness (ITU-R BT.601)."""
 UNIFORM_PATTERNS = 59
 
 
@@ -43,7 +45,7 @@ def control_features(
     if name == "pixels":
         return pixel_features(chosen)
     if name in DESCRIPTORS:
-        return DESCRIPTORS[name](chosen, progress=progress)
+        return descriptor_features(name, chosen, progress=progress)
     if name == "noise":
         noise = np.random.default_rng(seed).standard_normal((len(chosen), components))
         return control_table(chosen, name, noise, {"seed": seed})  # the chance level of any protocol
@@ -90,72 +92,62 @@ def pca_features(
     return control_table(images, "pca", pca.transform(flat_pixels(images.images)), facts)
 
 
-def hog_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
-    """Histograms of oriented gradients, factor ``hog``; each block of 36 has length 1 at most."""
-    height, width = images.images.shape[-2:]
+def hog(image: np.ndarray) -> np.ndarray:
+    """Histograms of oriented gradients of (3, H, W) bytes; each block of 36 numbers has length 1 at most."""
+    height, width = image.shape[1:]
     if min(height, width) < BLOCK_CELLS * CELL_PX:
         raise ValueError(f"{height}x{width} pixels are too few: HOG needs {BLOCK_CELLS * CELL_PX} a side")
-    hog = optional("skimage.feature", "the baseline hog").hog
-
-    def described(image: np.ndarray) -> np.ndarray:
-        return hog(
-            np.moveaxis(image, 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
-            pixels_per_cell=(CELL_PX, CELL_PX), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
-        )  # fmt: skip
-
-    facts = {"orientations": ORIENTATIONS, "cell_px": CELL_PX, "block": BLOCK_CELLS}
-    return control_table(images, "hog", _each(images, described, progress), facts)
+    return optional("skimage.feature", "the baseline hog").hog(
+        np.moveaxis(image, 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
+        pixels_per_cell=(CELL_PX, CELL_PX), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
+    )  # fmt: skip
 
 
-def lbp_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
-    """Square roots of the shares of local binary patterns in cells, factor ``lbp``; each cell has length 1.
+def lbp(image: np.ndarray) -> np.ndarray:
+    """Square roots of shares of local binary patterns in cells of (3, H, W) bytes; each cell has length 1.
 
     Pixels beyond the last whole cell at the right and below are not described.
     """
     patterns = optional("skimage.feature", "the baseline lbp").local_binary_pattern
-
-    def described(image: np.ndarray) -> np.ndarray:
-        codes = patterns(_luma(image).round().astype(np.uint8), 8, 2, "nri_uniform").astype(np.int64)
-        rows, columns = (side // CELL_PX for side in codes.shape)
-        cell = np.arange(rows * columns).reshape(rows, columns).repeat(CELL_PX, 0).repeat(CELL_PX, 1)
-        numbers = cell * UNIFORM_PATTERNS + codes[: rows * CELL_PX, : columns * CELL_PX]
-        counts = np.bincount(numbers.ravel(), minlength=rows * columns * UNIFORM_PATTERNS)
-        return np.sqrt(counts) / CELL_PX
-
-    return control_table(images, "lbp", _each(images, described, progress), {"cell_px": CELL_PX})
+    codes = patterns(_luma(image).round().astype(np.uint8), 8, 2, "nri_uniform").astype(np.int64)
+    rows, columns = (side // CELL_PX for side in codes.shape)
+    cell = np.arange(rows * columns).reshape(rows, columns).repeat(CELL_PX, 0).repeat(CELL_PX, 1)
+    numbers = cell * UNIFORM_PATTERNS + codes[: rows * CELL_PX, : columns * CELL_PX]
+    counts = np.bincount(numbers.ravel(), minlength=rows * columns * UNIFORM_PATTERNS)
+    return np.sqrt(counts) / CELL_PX
 
 
-def gradientfaces_features(images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
+def gradientfaces(image: np.ndarray) -> np.ndarray:
     """Cosine and sine of the direction of each pixel's gradient after a Gaussian blur of 0.75 pixels.
 
-    Factor ``gradientfaces``, two numbers a pixel; a pixel without a gradient has direction 0.
+    Two numbers a pixel of (3, H, W) bytes; a pixel without a gradient has direction 0.
     """
-
-    def described(image: np.ndarray) -> np.ndarray:
-        down, right = np.gradient(gaussian_filter(_luma(image), BLUR_PX))
-        angle = np.arctan2(down, right)
-        return np.concatenate([np.cos(angle).ravel(), np.sin(angle).ravel()])
-
-    return control_table(images, "gradientfaces", _each(images, described, progress), {"blur_px": BLUR_PX})
+    down, right = np.gradient(gaussian_filter(_luma(image), BLUR_PX))
+    angle = np.arctan2(down, right)
+    return np.concatenate([np.cos(angle).ravel(), np.sin(angle).ravel()])
 
 
-DESCRIPTORS = {"gradientfaces": gradientfaces_features, "hog": hog_features, "lbp": lbp_features}
-"""Controls that describe each image by itself, and know nothing of others."""
+DESCRIPTORS: Mapping[str, tuple[Callable[[np.ndarray], np.ndarray], Mapping[str, Any]]] = {
+    "gradientfaces": (gradientfaces, {"blur_px": BLUR_PX}),
+    "hog": (hog, {"orientations": ORIENTATIONS, "cell_px": CELL_PX, "block": BLOCK_CELLS}),
+    "lbp": (lbp, {"cell_px": CELL_PX}),
+}
+"""Controls that describe each image by itself, and know nothing of others; and the facts of their tables."""
 
 
-def _luma(image: np.ndarray) -> np.ndarray:
-    """Brightness 0..255 of (3, H, W)."""
-    return np.tensordot((0.299, 0.587, 0.114), image.astype(np.float64), 1)
-
-
-def _each(images: ImageSet, describe: Any, progress: Progress | None) -> np.ndarray:
-    """(N, D) numbers that describe each image."""
-    rows = []
+def descriptor_features(name: str, images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:
+    """The table of one of ``DESCRIPTORS``, which is also its factor."""
+    (describe, facts), rows = DESCRIPTORS[name], []
     for image in images.images:
         rows.append(describe(np.asarray(image)).astype(np.float32))
         if progress is not None and (len(rows) % 64 == 0 or len(rows) == len(images)):
             progress(len(rows), len(images))
-    return np.stack(rows)
+    return control_table(images, name, np.stack(rows), facts)
+
+
+def _luma(image: np.ndarray) -> np.ndarray:
+    """Brightness 0..255 of (3, H, W)."""
+    return np.tensordot(LUMINANCE, image.astype(np.float64), 1)
 
 
 def untrained_twin(model: Any, seed: int) -> Any:

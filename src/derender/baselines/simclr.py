@@ -22,6 +22,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import affine_grid, conv2d, grid_sample, normalize, pad
 
 from derender.baselines.autoencoders import AutoencoderSettings
+from derender.baselines.controls import LUMINANCE
 from derender.baselines.model import Features, Images, LoopModel, LossInputs
 from derender.model import Derenderer, load
 from derender.objectives.loocc import nt_xent
@@ -32,7 +33,6 @@ from derender.training.config import LoopSettings, OptimiserSettings
 from derender.training.step import fill_uncovered
 from derender.training.task import PhaseProgress
 
-LUMINANCE = (0.299, 0.587, 0.114)
 Views = Callable[[Images, Generator], Images]
 
 

@@ -140,13 +140,17 @@ def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:
         raise ValueError(f"name a label to learn, as in --set labels=NAME; the images have {known}")
     train = split_indices(images.files, config.split, seed=config.seed).train
     known = ~np.any([missing(images.label(name)[train]) for name in config.labels], axis=0)
-    rows = np.random.default_rng(config.seed).permutation(train[known])
-    if len(rows) < config.labelled:
+    return drawn_labelled(train[known], config.labelled, config.seed, ", ".join(config.labels))
+
+
+def drawn_labelled(rows: np.ndarray, count: int, seed: int, names: str) -> np.ndarray:
+    """So many of the training part's rows that have the labels ``names``; fewer are an error."""
+    if len(rows) < count:
         raise ValueError(
-            f"{config.labelled:,} labelled images were requested, the training part has {len(rows):,} "
-            f"with {', '.join(config.labels)}: set labelled={len(rows)} or fewer"
+            f"{count:,} labelled images were requested, the training part has {len(rows):,} with {names}: "
+            f"set labelled={len(rows)} or fewer"
         )
-    return rows[: config.labelled]
+    return np.random.default_rng(seed).permutation(rows)[:count]
 
 
 def encode_labels(

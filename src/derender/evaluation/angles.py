@@ -19,7 +19,7 @@ from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet
 from derender.data.layouts import rendered
 from derender.data.layouts.layout import base_name
-from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, group_resamples, numbers_of
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
 from derender.evaluation.depth import angle_deg
 from derender.evaluation.factors import light_in_camera
 from derender.evaluation.image_scores import binned_rows
@@ -43,21 +43,15 @@ LIGHT = {"azimuth": "light_azimuth_deg", "elevation": "light_elevation_deg"}
 
 
 def agreement(predicted: np.ndarray, true: np.ndarray, weights: np.ndarray) -> dict[str, Estimate]:
-    """The scores of ``AGREEMENT`` of (N,) numbers, with intervals from (B, N) resamples."""
-    offset = float(np.mean(predicted - true))
-
-    def scores(weights: np.ndarray) -> tuple[np.ndarray, ...]:
-        total = weights.sum(axis=1)
-        x, y = predicted - predicted.mean(), true - true.mean()
-        mx, my, xy, xx, yy = (weights @ one / total for one in (x, y, x * y, x * x, y * y))
-        with np.errstate(invalid="ignore", divide="ignore"):  # a constant has no correlation: NaN
-            covariance, spread, true_spread = xy - mx * my, xx - mx * mx, yy - my * my
-            r = np.where(spread > 1e-12, covariance / np.sqrt(spread * true_spread), np.nan)
-            error = weights @ np.abs(predicted - true - offset) / total
-            return r, covariance / true_spread, error, weights @ (predicted - true) / total
-
-    result = scores(np.concatenate((np.ones((1, len(true))), weights)))  # first every row once
-    return {name: estimate(own[:1], own[1:]) for name, own in zip(AGREEMENT, result, strict=True)}
+    """The scores of ``AGREEMENT`` of (N,) numbers, with intervals; weights are by ``once_and_resampled``."""
+    x, y, apart = predicted - predicted.mean(), true - true.mean(), predicted - true
+    of_each = (x, y, x * y, x * x, y * y, apart, np.abs(apart - apart.mean()))
+    mx, my, xy, xx, yy, offset, error = (weights @ one / weights.sum(axis=1) for one in of_each)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a constant has no correlation: NaN
+        covariance, spread, true_spread = xy - mx * my, xx - mx * mx, yy - my * my
+        r = np.where(spread > 1e-12, covariance / np.sqrt(spread * true_spread), np.nan)
+        scores = (r, covariance / true_spread, error, offset)
+    return {name: estimate(own[:1], own[1:]) for name, own in zip(AGREEMENT, scores, strict=True)}
 
 
 def agreement_table(
@@ -135,8 +129,8 @@ def _angles(
 
         parts = map_batches(see, net, read.images, batch_size=64, progress=how.stage(name))
         results[name] = np.concatenate(parts)
-    people = read.labels.get("identity", np.array(read.files))
-    weights = group_resamples(people.astype(str), how.resamples, how.seed)
+    people = read.labels.get("identity", np.array(read.files)).astype(str)
+    weights = once_and_resampled(people, how.resamples, how.seed)
     tables: list[ScoreTable] = []
     values: dict[str, Any] = {"pictures": len(read)}
     for column, name in enumerate(labels):
@@ -145,25 +139,18 @@ def _angles(
         shown, values[name] = agreement_table(caption, answers, true[:, column], weights)
         tables.append(shown)
     if what == "Light":
-        rows, columns = _directions(results, true, people.astype(str), how)
+        aim = _unit(true)
+        aimed = {name: _unit(angles) for name, angles in results.items()}
+        aimed["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
+        apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in aimed.items()}
+        off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
+        rows, columns, _ = binned_rows(
+            apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
+        )
         caption = "Light: degrees between true and predicted direction, by the angle between light and view"
         tables.append(scored_table(caption, "prediction", rows, columns, deviations=()))
         values["direction"] = numbers_of(rows)
     return Scores(tables, values, how.notes)
-
-
-def _directions(
-    result: Mapping[str, np.ndarray], true: np.ndarray, people: np.ndarray, how: Options
-) -> tuple[Sequence[ScoredRow], Mapping[str, Column]]:
-    """Angle between true and predicted direction, all and by the angle between light and view."""
-    aim = _unit(true)
-    answers = {name: _unit(angles) for name, angles in result.items()}
-    answers["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
-    off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
-    apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in answers.items()}
-    return binned_rows(
-        apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
-    )[:2]
 
 
 def known_angles(

@@ -92,10 +92,18 @@ def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np
         yield np.bincount(drawn.ravel(), minlength=size * n_rows).reshape(size, n_rows).astype(np.float32)
 
 
-def group_resamples(groups: np.ndarray, count: int = RESAMPLES, seed: int = 0) -> np.ndarray:
-    """How often each of N rows is drawn, (count, N), where rows of one group are drawn together."""
-    group = np.unique(groups, return_inverse=True)[1]
-    return np.concatenate(list(resamples(int(group.max()) + 1, count, seed)))[:, group]
+def once_and_resampled(groups: np.ndarray | int, count: int = RESAMPLES, seed: int = 0) -> np.ndarray:
+    """First every row once, then ``count`` resamples: how often each is drawn, (1 + count, N) float32.
+
+    Rows of one of the (N,) ``groups`` are drawn together; a number of rows has no groups.
+    """
+    if isinstance(groups, int):
+        units, unit_of = groups, slice(None)
+    else:
+        names, unit_of = np.unique(groups, return_inverse=True)
+        units = len(names)
+    drawn = [np.ones((1, units), np.float32), *resamples(units, count, seed)]
+    return np.concatenate(drawn)[:, unit_of]
 
 
 def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: float = np.inf) -> Estimate:
@@ -116,14 +124,11 @@ def constant(runs: float | Runs, count: int = RESAMPLES) -> Estimate:
     return Estimate(value, NAN, NAN, _deviation(np.atleast_1d(runs)), np.full(count, value))
 
 
-def scored_row(
-    name: str, control: bool, scores: Sequence[str], runs: np.ndarray, resampled: np.ndarray, **how: Any
-) -> ScoredRow:
-    """A row of (runs, scores) values and (B, scores) means on resamples; ``how`` is that of ``estimate``."""
-    columns = zip(scores, np.transpose(runs), np.transpose(resampled), strict=True)
-    return ScoredRow(
-        name, control, len(runs), {one: estimate(own, drawn, **how) for one, own, drawn in columns}
-    )
+def scored_row(name: str, control: bool, scores: Iterable[str], values: np.ndarray, **how: Any) -> ScoredRow:
+    """A row of (runs, 1 + B, scores) values by ``once_and_resampled``; ``how`` is that of ``estimate``."""
+    columns = zip(scores, values[:, 0].T, values[:, 1:].mean(axis=0).T, strict=True)
+    own = {score: estimate(runs, resampled, **how) for score, runs, resampled in columns}
+    return ScoredRow(name, control, len(values), own)
 
 
 def difference(ours: Estimate, rivals: Mapping[str, Estimate], *, lower: bool = False) -> Difference:

@@ -10,20 +10,13 @@ Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering wi
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    constant,
-    numbers_of,
-    resamples,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
@@ -38,15 +31,7 @@ from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import FeatureSource, check_lengths, chosen_labels, prepare
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import (
-    Column,
-    Row,
-    Scores,
-    ScoreTable,
-    scored_table,
-    verdict,
-    verdict_table,
-)
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, judged_tables, verdict
 from derender.features import missing
 
 
@@ -86,8 +71,7 @@ def cluster(
         ready.features, ready.labels, controls=ready.controls, method=method, n_clusters=clusters,
         resample_count=how.resamples, seed=how.seed, memory=how.memory,
     )  # fmt: skip
-    caption = "Above the strongest control? (paired resamples of the rows)"
-    tables = [clustering_table(result), verdict_table(result.rows, CLUSTER_COLUMNS, caption)]
+    tables = clustering_tables(result, "Above the strongest control? (paired resamples of the rows)")
     levels = {}
     if method == "finch" and len(names) == 1:
         for row in rows:
@@ -113,7 +97,7 @@ class ClusterComparison:
     ``n_missing`` single labels are unknown among the others. ``per_label`` has the scores of each first run.
     """
 
-    rows: tuple[ScoredRow, ...]
+    rows: tuple[bootstrap.ScoredRow, ...]
     method: str
     labels: Mapping[str, int]
     n_rows: int
@@ -123,14 +107,7 @@ class ClusterComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        return {**vars(self), "rows": numbers_of(self.rows)}
-
-
-def about_clustering(method: str, n_rows: int, labels: Mapping[str, int]) -> str:
-    """Method, rows and labels in words; ``labels`` holds the number of classes by name."""
-    (name, classes), *others = labels.items()
-    what = f"mean of {len(labels)} labels" if others else f"{classes} classes of {name}"
-    return f"{METHODS[method]}: {n_rows:,} rows, {what}"
+        return {**vars(self), "rows": bootstrap.numbers_of(self.rows)}
 
 
 def compare_clusterings(
@@ -140,7 +117,7 @@ def compare_clusterings(
     controls: Collection[str] = (),
     method: str = "ward",
     n_clusters: int | None = None,
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     seed: int = 0,
     memory: Memory | None = None,
 ) -> ClusterComparison:
@@ -159,7 +136,8 @@ def compare_clusterings(
     numbers = {name: _numbered(values[labelled], name) for name, values in columns.items()}
     sizes = {name: int(values.max()) + 1 for name, values in numbers.items()}
     clusters = {name: size if n_clusters is None else n_clusters for name, size in sizes.items()}
-    n_rows, once = int(labelled.sum()), np.ones((1, labelled.sum()), np.float32)
+    n_rows = int(labelled.sum())
+    once = np.ones((1, n_rows), np.float32)
 
     runs, starts = {}, range(seed, seed + (5 if method == "k-means" else 1))
     for name, arrays in features.items():
@@ -171,29 +149,25 @@ def compare_clusterings(
 
     scorers = {name: [_scorer(numbers, run) for run in own] for name, own in runs.items()}
     drawn: dict[str, list[np.ndarray]] = {name: [] for name in runs}
-    for weights in resamples(n_rows, resample_count, seed):
+    for weights in chain([once], bootstrap.resamples(n_rows, resample_count, seed)):
         for name, own in scorers.items():
-            drawn[name].append(np.stack([score(weights).mean(axis=1) for score in own]))
+            drawn[name].append(np.stack([score(weights) for score in own]))
     rows, per_label = [], {}
-    for name, own in scorers.items():
-        plain = np.stack([score(once)[0] for score in own])  # (runs, labels, scores)
-        resampled = np.concatenate(drawn[name], axis=1).mean(axis=0)
-        quiet = name in controls or name == "majority"
-        rows.append(
-            scored_row(name, quiet, tuple(METRICS), plain.mean(axis=1), resampled, centred=True, most=1.0)
-        )
-        per_label[name] = {
-            label: dict(zip(METRICS, values, strict=True))
-            for label, values in zip(labels, plain[0].tolist(), strict=True)
-        }
+    for name, parts in drawn.items():
+        values = np.concatenate(parts, axis=1)  # (runs, 1 + resamples, labels, scores)
+        quiet = {*controls, "majority"}
+        mean = values.mean(axis=2)
+        rows.append(bootstrap.scored_row(name, name in quiet, METRICS, mean, centred=True, most=1.0))
+        first_run = zip(labels, values[0, 0].tolist(), strict=True)
+        per_label[name] = {label: dict(zip(METRICS, own, strict=True)) for label, own in first_run}
     orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
     deals = [_scorer(numbers, {label: own[order] for label, own in first.items()}) for order in orders]
     chance = np.stack([deal(once)[0].mean(axis=0) for deal in deals], axis=1)
-    result = {score: constant(own, resample_count) for score, own in zip(METRICS, chance, strict=True)}
-    rows.append(ScoredRow("chance", True, len(deals), result))
+    same = [bootstrap.constant(own, resample_count) for own in chance]
+    rows.append(bootstrap.ScoredRow("chance", True, len(deals), dict(zip(METRICS, same, strict=True))))
     n_missing = sum(int((values < 0).sum()) for values in numbers.values())
-    dropped = int((~labelled).sum())
-    return ClusterComparison(with_verdicts(rows), method, sizes, n_rows, dropped, n_missing, per_label)
+    judged, dropped = bootstrap.with_verdicts(rows), int((~labelled).sum())
+    return ClusterComparison(judged, method, sizes, n_rows, dropped, n_missing, per_label)
 
 
 def _numbered(values: np.ndarray, name: str) -> np.ndarray:
@@ -238,14 +212,16 @@ def _scorer(
     return scores
 
 
-def clustering_table(result: ClusterComparison) -> ScoreTable:
-    """One row for each feature and control, every score."""
-    caption = about_clustering(result.method, result.n_rows, result.labels)
+def clustering_tables(result: ClusterComparison, asked: str) -> list[ScoreTable]:
+    """One row for each feature and control, every score; and the verdicts, captioned ``asked``."""
+    (name, classes), *others = result.labels.items()
+    what = f"mean of {len(result.labels)} labels" if others else f"{classes} classes of {name}"
+    caption = f"{METHODS[result.method]}: {result.n_rows:,} rows, {what}"
     if result.n_dropped:
         caption += f"; {result.n_dropped:,} rows without label left out"
     if result.n_missing:
         caption += f"; {result.n_missing:,} single labels unknown"
-    return scored_table(caption, "features", result.rows, CLUSTER_COLUMNS)
+    return judged_tables(caption, "features", result.rows, CLUSTER_COLUMNS, asked)
 
 
 @dataclass(frozen=True)

@@ -33,13 +33,6 @@ from sklearn.cluster import KMeans, MiniBatchKMeans
 
 from derender.evaluation import neighbours
 from derender.evaluation.memory import Memory
-from derender.evaluation.neighbours import (
-    CELL_ROWS,
-    cells,
-    finite_rows,
-    nearest_rows,
-    of_each,
-)
 from derender.features import named
 
 FLOAT64_ROWS = 20_000  # above, nearest neighbours are looked up in float32; heights are always float64
@@ -57,7 +50,7 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
     of rows. The distance is sqrt(2ab/(a+b)) times that of the means, as in SciPy. The means of N rows are all
     it holds, and one block of distances.
     """
-    means = finite_rows(features, "Ward clustering").astype(np.float64, copy=False)
+    means = neighbours.finite_rows(features, "Ward clustering").astype(np.float64, copy=False)
     means = means - means.mean(axis=0)  # keeps the distances, and more of their digits
     count = len(means)
     sizes = np.ones(count) if sizes is None else np.array(sizes, np.float64)
@@ -118,12 +111,12 @@ def by_appearance(names: np.ndarray) -> np.ndarray:
 
 
 def ward_in_cells(
-    features: np.ndarray, leaves: int = LEAVES, rows_per_cell: int = CELL_ROWS
+    features: np.ndarray, leaves: int = LEAVES, rows_per_cell: int = neighbours.CELL_ROWS
 ) -> dict[str, np.ndarray]:
     """Approximate Ward over the rows of (N, D) features: ``tree`` and ``leaf``, as ``cut`` takes them."""
-    points = finite_rows(features, "Ward clustering").astype(np.float32, copy=False)
-    groups = cells(points, rows_per_cell)
-    trees = list(of_each(lambda cell: _tree(points[groups[cell]]), groups))
+    points = neighbours.finite_rows(features, "Ward clustering").astype(np.float32, copy=False)
+    groups = neighbours.cells(points, rows_per_cell)
+    trees = list(neighbours.of_each(lambda cell: _tree(points[groups[cell]]), groups))
     # the cheapest merges of all cells are made until so many clusters are left
     heights = np.concatenate([tree[:, 2] for tree in trees])
     cell = np.repeat(np.arange(len(groups)), [len(tree) for tree in trees])
@@ -223,7 +216,7 @@ def clusterings(
     ``method`` is one of ``METHODS``, ``seed`` for the starts of k-means, ``memory`` the cache of the trees.
     """
     memory, wanted = memory or Memory(), sorted(set(counts))
-    features = finite_rows(features, "clustering")
+    features = neighbours.finite_rows(features, "clustering")
     named(METHODS, method, "method")
     for count in wanted:
         if not 1 <= count <= len(features):
@@ -253,7 +246,7 @@ def clusterings(
 
 def finch(features: np.ndarray, memory: Memory | None = None) -> FinchHierarchy:
     """FINCH's whole hierarchy over the rows of (N, D) features, cached in ``memory``."""
-    features = finite_rows(features, "FINCH")
+    features = neighbours.finite_rows(features, "FINCH")
 
     def make() -> np.ndarray:
         partitions = [_linked(features)]
@@ -279,7 +272,7 @@ def finch_clusters(
     Raises:
         ValueError: more clusters than the finest partition has: FINCH cannot make them.
     """
-    features = finite_rows(features, "FINCH")
+    features = neighbours.finite_rows(features, "FINCH")
     hierarchy = hierarchy or finch(features)
     if not 1 <= n_clusters <= hierarchy.counts[0]:
         raise ValueError(
@@ -289,7 +282,7 @@ def finch_clusters(
     partition = [part for part in hierarchy.partitions if part.max() + 1 >= n_clusters][-1]
     means, sizes = _means(features, partition), np.bincount(partition)
     while len(means) > n_clusters:
-        nearest, distance = nearest_rows(means)
+        nearest, distance = neighbours.nearest_rows(means)
         pair = distance.argmin()
         first, second = sorted((pair, nearest[pair]))
         means[first] += (means[second] - means[first]) * sizes[second] / (sizes[first] + sizes[second])
@@ -303,7 +296,9 @@ def finch_clusters(
 def _linked(rows: np.ndarray) -> np.ndarray:
     """Connected parts of the links from each row to its nearest."""
     count = len(rows)
-    links = csr_array((np.ones(count), (np.arange(count), nearest_rows(rows)[0])), shape=(count, count))
+    links = csr_array(
+        (np.ones(count), (np.arange(count), neighbours.nearest_rows(rows)[0])), shape=(count, count)
+    )
     return connected_components(links, directed=True, connection="weak")[1]
 
 

@@ -5,13 +5,13 @@ the pixels themselves. Tables of identity and class also have descriptors, of th
 with those of its mirror image: whitened features see both.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from pydantic import ValidationError
 
-from derender.baselines.controls import DESCRIPTORS, control_table, pca_features, pixel_features
+from derender.baselines.controls import control_table, descriptor_features, pca_features, pixel_features
 from derender.data import ImageSet
 from derender.evaluation.feature_rows import FeatureRow, FeatureSource, check_rows, embedded_table, one_row
 from derender.evaluation.options import Options
@@ -21,7 +21,7 @@ from derender.model import Derenderer
 from derender.presets import ModelSettings
 
 UNTRAINED = "untrained encoder"
-_SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
+DESCRIPTORS_SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
 
 def subject_and_controls(features: FeatureSource, options: Options) -> list[FeatureRow]:
@@ -48,13 +48,13 @@ def control_rows(
     Without ``settings``, an architecture, there is no untrained encoder. PCA gets its components from
     ``fit_on``, by default ``images``.
     """
-    rows = []
+    rows, tables = [], []
     if settings is not None:
-        twins = {
-            seed: Derenderer.seeded(settings, seed).to(device_named(options.device)).eval()
-            for seed in options.seeds(options.untrained_seeds)
-        }
-        rows.append(_untrained_row(twins, images, options))
+        for seed in options.seeds(options.untrained_seeds):
+            encoder = Derenderer.seeded(settings, seed).to(device_named(options.device)).eval()
+            table = embedded_table(encoder, images, options.memory, options.stage(f"{UNTRAINED} {seed}"))
+            tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
+        rows.append(FeatureRow(UNTRAINED, tuple(tables), options.chosen, control=True))
     fitted = images if fit_on is None else fit_on
     components = component_count(len(fitted))  # whitening needs many more rows than components
     inputs = {"images": images.images, "components": components}
@@ -68,26 +68,18 @@ def control_rows(
         f"PCA ({components}), whitened, is fitted to {len(fitted):,} images of {fitted.source}"
     )
     rows.append(FeatureRow("pixels", (pixel_features(images),), control=True))
-    for name, describe in DESCRIPTORS.items() if options.descriptors else ():
+    for name, shown in DESCRIPTORS_SHOWN.items() if options.descriptors else ():
         try:
-            table = describe(images, progress=options.stage(name))
+            table = descriptor_features(name, images, progress=options.stage(name))
             mirrored = replace(images, images=np.ascontiguousarray(images.images[..., ::-1]))
-            other = describe(mirrored, progress=options.stage(f"{name} of mirror images"))
+            other = descriptor_features(name, mirrored, progress=options.stage(f"{name} of mirror images"))
         except ValueError as error:  # a package is missing, or images are smaller than a cell
             options.notes.append(f"{name} left out: {error}")
         else:
             both = replace(table, factors={name: (table.factors[name] + other.factors[name]) / 2})
-            rows.append(FeatureRow(_SHOWN[name], (table,), control=True))
-            rows.append(FeatureRow(f"{_SHOWN[name]} with mirror image", (both,), control=True))
+            rows.append(FeatureRow(shown, (table,), control=True))
+            rows.append(FeatureRow(f"{shown} with mirror image", (both,), control=True))
     return rows
-
-
-def _untrained_row(encoders: Mapping[int, Derenderer], images: ImageSet, options: Options) -> FeatureRow:
-    tables = []
-    for seed, encoder in encoders.items():
-        table = embedded_table(encoder, images, options.memory, options.stage(f"{UNTRAINED} {seed}"))
-        tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
-    return FeatureRow(UNTRAINED, tuple(tables), options.chosen, control=True)
 
 
 def architecture(rows: Sequence[FeatureRow]) -> ModelSettings | None:

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_erosion, generate_binary_structure
 from torch import Tensor
 
 from derender.data import GroundTruth
-from derender.evaluation.image_scores import ImageResult
+from derender.evaluation.image_scores import ImageResult, means_and_each
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 from derender.features.extract import check_size
@@ -109,14 +109,8 @@ def geometry_scores(
     side = mean((difference - mean(difference)[:, None, None]).square()).sqrt()
     normal = normals_from_depth(true, fov_deg) if normal_true is None else normal_true.double()
     mad = mean(angle_deg(normals_from_depth(predicted, fov_deg), normal))
-    return GeometryScores(
-        side=side.nanmean().item(),
-        mad_deg=mad.nanmean().item(),
-        coverage=(valid.sum() / inside.sum()).item(),
-        n_empty=int(side.isnan().sum()),
-        side_each=side.numpy(force=True),
-        mad_deg_each=mad.numpy(force=True),
-    )
+    coverage, n_empty = (valid.sum() / inside.sum()).item(), int(side.isnan().sum())
+    return GeometryScores(coverage=coverage, n_empty=n_empty, **means_and_each(side=side, mad_deg=mad))
 
 
 def average_depth(depth: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"]) -> Float[Tensor, "h w"]:

@@ -14,11 +14,12 @@ from typing import Any, ClassVar, Optional
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from derender.data import GroundTruth
 from derender.evaluation.depth import angle_deg
-from derender.evaluation.image_scores import ImageResult
+from derender.evaluation.image_scores import ImageResult, means_and_each
 from derender.evaluation.score_table import Column
 from derender.features import map_batches
 from derender.features.extract import check_size
@@ -142,10 +143,8 @@ def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "
     """
     predicted, true = (rotation_matrix(camera[:, :3].double()) for camera in (camera_pred, camera_true))
     rest = (true @ _nearest_rotation((true.mT @ predicted).sum(dim=0))).mT @ predicted
-    twist = rest - rest.mT
-    sine = torch.stack([twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0]]).norm(dim=0) / 2
-    cosine = (rest.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
-    return _angles(torch.rad2deg(torch.atan2(sine, cosine)))
+    angles_rad = Rotation.from_matrix(rest.numpy(force=True)).magnitude()
+    return _angles(torch.from_numpy(angles_rad).rad2deg())
 
 
 def evaluate_factors(
@@ -177,16 +176,13 @@ def evaluate_factors(
         raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
     constant = (true.sum(dim=0) / true_mask.sum(dim=0).clamp_min(1)).expand_as(true)
     direction = light_in_camera(true_light, true_camera)
-    albedos = {
-        "albedo": albedo_error(albedo, true, both),
-        "albedo_global": albedo_error(albedo, true, both, one_scale=True),
-        "albedo_control": albedo_error(constant, true, true_mask),
-        "albedo_global_control": albedo_error(constant, true, true_mask, one_scale=True),
-    }
-    scores: dict[str, Any] = {name: each.nanmean().item() for name, each in albedos.items()}
-    scores |= {f"{name}_each": each.numpy() for name, each in albedos.items()}
     return FactorResult(
-        **scores,
+        **means_and_each(
+            albedo=albedo_error(albedo, true, both),
+            albedo_global=albedo_error(albedo, true, both, one_scale=True),
+            albedo_control=albedo_error(constant, true, true_mask),
+            albedo_global_control=albedo_error(constant, true, true_mask, one_scale=True),
+        ),
         light=light_error(light, camera, true_light, true_camera),
         light_control=_angles(angle_deg(direction.mean(dim=0).expand_as(direction), direction)),
         light_aligned=light_error(light, camera, true_light, true_camera, aligned=True),

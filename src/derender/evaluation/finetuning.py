@@ -24,6 +24,7 @@ from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
 from derender.baselines.controls import untrained_twin
+from derender.baselines.supervised import drawn_labelled
 from derender.data import ImageSet, Split, split_indices
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, numbers_of, with_verdicts
 from derender.evaluation.controls import UNTRAINED, control_rows
@@ -149,12 +150,7 @@ def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
     split = split_indices(images.files, config.split, seed=config.seed)
     labelled = split.train[asked.known[split.train]]
     if target.labelled is not None:
-        if target.labelled > len(labelled):
-            raise ValueError(
-                f"{target.labelled:,} labelled images were requested, the training part has "
-                f"{len(labelled):,} with {names}: set labelled={len(labelled)} or fewer"
-            )
-        labelled = np.random.default_rng(config.seed).permutation(labelled)[: target.labelled]
+        labelled = drawn_labelled(labelled, target.labelled, config.seed, names)
     known = asked.targets[labelled]
     if not ((known == 1).any(axis=0) & (known == 0).any(axis=0)).any():
         raise ValueError(
@@ -297,7 +293,12 @@ def score_finetuned(
     answers = kept.recall_one("finetuned-answers", inputs, answered)
     learned_and_tested, count = np.concatenate([train, test]), len(train)
     start = (task.start or task.build().model).to(tuned.device)
-    runs = _features(start, task, learned_and_tested, kept)
+    parts = (learned_and_tested, target.split.train)
+    shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
+    models, factors = {"frozen": start, UNTRAINED: untrained_twin(start, seed)}, task.config.target.factors
+    runs = {name: [embedded_table(one, shown, kept).concatenate(factors)] for name, one in models.items()}
+    plain = control_rows(shown, None, Options(cache=kept), fit_on=fitted)  # which learned nothing
+    runs |= {row.name: row.arrays() for row in plain}
     asked = target.asked.select(learned_and_tested)
     rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
     how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}
@@ -329,15 +330,3 @@ def score_finetuned(
         "kind": asked.kind, "names": names, "n_train": count, "n_test": len(test), "n_unlabelled": unlabelled,
     }  # fmt: skip
     return Scores([table], values, notes, result=scored)
-
-
-def _features(
-    start: Derenderer, task: FinetuneTask, rows: np.ndarray, kept: Memory
-) -> dict[str, list[np.ndarray]]:
-    """Of some of the task's images (R, D) codes that training began with, and three that learned nothing."""
-    parts, factors = (rows, task.target.split.train), task.config.target.factors
-    shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
-    models = {"frozen": start, UNTRAINED: untrained_twin(start, task.config.seed)}
-    codes = {name: [embedded_table(one, shown, kept).concatenate(factors)] for name, one in models.items()}
-    plain = control_rows(shown, None, Options(cache=kept), fit_on=fitted)
-    return codes | {row.name: row.arrays() for row in plain}

@@ -13,21 +13,14 @@ from typing import Any
 import numpy as np
 
 from derender.data.layouts.layout import in_test_half, stem_of
-from derender.evaluation.bootstrap import (
-    ScoredRow,
-    constant,
-    estimate,
-    group_resamples,
-    numbers_of,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.clustering import compare_clusterings
 from derender.evaluation.controls import subject_and_controls
 from derender.evaluation.feature_rows import FeatureSource, is_model, prepare
 from derender.evaluation.image_scores import LIGHT_BINS_DEG, binned_rows
 from derender.evaluation.neighbours import unit_rows
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import Column, Scores, scored_table, verdict, verdict_table
+from derender.evaluation.score_table import Column, Scores, judged_tables, verdict
 from derender.features import FeatureTable, missing
 from derender.inputs import as_model
 from derender.storage.bounded import first_line, read_text
@@ -93,7 +86,8 @@ def identify(
             controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
         ).rows  # fmt: skip
         ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in result}
-        scored = with_verdicts([replace(row, scores={**row.scores, **ward[row.name]}) for row in scored])
+        both = [replace(row, scores={**row.scores, **ward[row.name]}) for row in scored]
+        scored = bootstrap.with_verdicts(both)
         note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
         columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
@@ -101,14 +95,12 @@ def identify(
         f"Identification: {len(probe):,} probes of {len(set(who[probe]))} people, gallery of "
         f"{int(shown.sum())}, nearest by cosine{' less the mean of the gallery' if centred else ''}"
     )
-    tables = [
-        scored_table(caption, "features", scored, columns, deviations=()),
-        verdict_table(scored, columns, "Above the strongest control? (people are resampled together)"),
-    ]
+    asked = "Above the strongest control? (people are resampled together)"
+    tables = judged_tables(caption, "features", scored, columns, asked, deviations=())
     values = {
         "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
         "probes": probes, "centred": centred,
-        "rows": numbers_of(scored),
+        "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
     return Scores(tables, values, [*how.notes, verdict(scored[0], "all"), how.memory.summary()], scored)
 
@@ -237,22 +229,21 @@ def verify(
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
-    drawn = group_resamples(np.arange(len(pairs)), how.resamples, how.seed)
-    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every pair once
+    weights = bootstrap.once_and_resampled(len(pairs), how.resamples, how.seed)
     scored, errors = [], {}
     for row in rows:
         runs = [_judged(run, sides, pairs) for run in row.arrays()]
         right = np.mean([own for own, _ in runs], axis=0)
         accuracy = weights @ right / weights.sum(axis=1)
         areas = np.stack([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs])
-        scores = {"accuracy": estimate(accuracy[:1], accuracy[1:])}
-        scores["auc"] = estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
+        scores = {"accuracy": bootstrap.estimate(accuracy[:1], accuracy[1:])}
+        scores["auc"] = bootstrap.estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
         each = [float(right[pairs.fold == fold].mean()) for fold in np.unique(pairs.fold)]
         errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
-        scored.append(ScoredRow(row.name, row.control, len(runs), scores))
-    half_right = constant(0.5, how.resamples)
-    scored.append(ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
-    scored = with_verdicts(scored)
+        scored.append(bootstrap.ScoredRow(row.name, row.control, len(runs), scores))
+    half_right = bootstrap.constant(0.5, how.resamples)
+    scored.append(bootstrap.ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
+    scored = bootstrap.with_verdicts(scored)
     columns = {
         "accuracy": Column("accuracy", "high", note="share of pairs judged right, mean over folds"),
         "auc": Column("AUC", "high", note="area under the ROC curve over all pairs"),
@@ -263,17 +254,16 @@ def verify(
         f"Verification: {n_same:,} pairs of one person, {len(pairs) - n_same:,} of two, {n_folds} folds, "
         "threshold and mean from the other folds"
     )
-    shown = scored_table(
-        caption, "features", scored, columns, intervals=tuple(columns), deviations=(),
-        more={error: lambda row: errors.get(row.name)},
-    )  # fmt: skip
-    judged = verdict_table(scored, columns, "Above the strongest control? (paired resamples of pairs)")
+    asked = "Above the strongest control? (paired resamples of pairs)"
+    more = {error: lambda row: errors.get(row.name)}
+    every: dict[str, Any] = {"intervals": tuple(columns), "deviations": (), "more": more}
+    tables = judged_tables(caption, "features", scored, columns, asked, **every)
     values = {
         "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
-        "rows": numbers_of(scored),
+        "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
     notes = [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()]
-    return Scores([shown, judged], values, notes, scored)
+    return Scores(tables, values, notes, scored)
 
 
 def _in_half(pairs: Pairs, half: str) -> Pairs:

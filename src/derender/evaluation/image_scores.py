@@ -12,15 +12,9 @@ from math import isfinite
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from torch import Tensor
 
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    Estimate,
-    ScoredRow,
-    estimate,
-    group_resamples,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap
 from derender.evaluation.score_table import Column, ScoreTable, scored_table
 
 LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
@@ -50,11 +44,11 @@ class ImageResult:
             for row, one in self.named().items()
         }
 
-    def rows(self, resample_count: int = RESAMPLES) -> tuple[ScoredRow, ...]:
+    def rows(self, resample_count: int = bootstrap.RESAMPLES) -> tuple[bootstrap.ScoredRow, ...]:
         """The model, then its controls, with intervals."""
         return image_rows(self.each(), self.columns, resample_count=resample_count)
 
-    def table(self, rows: Sequence[ScoredRow] | None = None) -> ScoreTable:
+    def table(self, rows: Sequence[bootstrap.ScoredRow] | None = None) -> ScoreTable:
         """The scores in the units of the columns; with ``rows``, their intervals too."""
         count = len(next(iter(self.each()["model"].values())))
         more = {} if self.coverage is None else {self.coverage: lambda row: self.named()[row.name].coverage}
@@ -65,27 +59,34 @@ class ImageResult:
         return replace(result, rows=[replace(row, note=self.notes.get(row.name, "")) for row in result.rows])
 
 
+def means_and_each(**scores: Tensor) -> dict[str, Any]:
+    """The mean of (N,) values of each score over the images that have one; all of them as ``SCORE_each``."""
+    means = {name: values.nanmean().item() for name, values in scores.items()}
+    return means | {f"{name}_each": values.numpy(force=True) for name, values in scores.items()}
+
+
 def image_rows(
     scores: Mapping[str, Mapping[str, np.ndarray]],
     columns: Mapping[str, Column],
     *,
     controls: Collection[str] | None = None,
     groups: np.ndarray | None = None,
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     seed: int = 0,
-) -> tuple[ScoredRow, ...]:
+) -> tuple[bootstrap.ScoredRow, ...]:
     """A row for each name in ``scores``, which holds every score's (N,) values of the same images, NaN where
     there is none. ``controls`` are by default all rows but the first; images of one of the (N,) ``groups``,
     such as people, are resampled together.
     """
     count = max(len(values) for each in scores.values() for values in each.values())
-    weights = group_resamples(np.arange(count) if groups is None else groups, resample_count, seed)
+    weights = bootstrap.once_and_resampled(count if groups is None else groups, resample_count, seed)
     quiet = list(scores)[1:] if controls is None else controls
     rows = []
     for name, each in scores.items():
         result = {score: _estimate(values, weights) for score, values in each.items()}
-        rows.append(ScoredRow(name, name in quiet, 1, result))
-    return with_verdicts(rows, lower=[name for name, column in columns.items() if column.best == "low"])
+        rows.append(bootstrap.ScoredRow(name, name in quiet, 1, result))
+    lower = [name for name, column in columns.items() if column.best == "low"]
+    return bootstrap.with_verdicts(rows, lower=lower)
 
 
 def binned_rows(
@@ -96,7 +97,7 @@ def binned_rows(
     digits: int = 3,
     bins: Sequence[float] = LIGHT_BINS_DEG,
     **how: Any,
-) -> tuple[tuple[ScoredRow, ...], dict[str, Column], dict[str, int]]:
+) -> tuple[tuple[bootstrap.ScoredRow, ...], dict[str, Column], dict[str, int]]:
     """Rows of (N,) scores; columns for all and for groups by (N,) angles in degrees; number of images in
     each.
 
@@ -118,7 +119,7 @@ def binned_rows(
     return image_rows(each, columns, **how), columns, counts
 
 
-def image_verdicts(row: ScoredRow, columns: Mapping[str, Column]) -> list[str]:
+def image_verdicts(row: bootstrap.ScoredRow, columns: Mapping[str, Column]) -> list[str]:
     """In words, for every score: the row against the strongest control."""
     results = []
     for score, column in columns.items():
@@ -134,12 +135,13 @@ def image_verdicts(row: ScoredRow, columns: Mapping[str, Column]) -> list[str]:
     return results
 
 
-def _estimate(values: np.ndarray, weights: np.ndarray) -> Estimate:
+def _estimate(values: np.ndarray, weights: np.ndarray) -> bootstrap.Estimate:
     values = np.asarray(values, np.float64)
     known = ~np.isnan(values)
-    if known.sum() < 2:  # nothing to resample
-        value = float(values[known].mean()) if known.any() else float("nan")
-        return estimate([value], np.full(len(weights), np.nan))
-    mean, count = float(values[known].mean()), weights[:, known].sum(axis=1)
-    total = weights[:, known] @ values[known]
-    return estimate([mean], np.divide(total, count, out=np.full(len(weights), mean), where=count > 0))
+    mean = values[known].mean() if known.any() else np.nan
+    means = np.full(len(weights) - 1, np.nan)
+    if known.sum() > 1:  # else there is nothing to resample
+        drawn = weights[1:, known]
+        count = drawn.sum(axis=1)
+        means = np.divide(drawn @ values[known], count, out=np.full(len(drawn), mean), where=count > 0)
+    return bootstrap.estimate([mean], means)

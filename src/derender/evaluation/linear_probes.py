@@ -103,21 +103,17 @@ def probe(
 
 
 def probe_runs(
-    head: str,
-    arrays: Sequence[np.ndarray],
-    task: Task,
-    rows: np.ndarray,
-    tested: np.ndarray,
-    seeds: Sequence[int],
-    settings: HeadSettings,
-    memory: Memory | None,
-) -> np.ndarray:
-    """(S, T, A) answers; seed s uses run s modulo their number, and seeds that share a run learn together."""
+    head: str, arrays: Sequence[np.ndarray], task: Task, rows: np.ndarray, tested: np.ndarray,
+    seeds: Sequence[int], **how: Any,
+) -> np.ndarray:  # fmt: skip
+    """Answers of ``probe`` by several runs of one kind of feature: (S, T, A); ``how`` are its keywords.
+
+    Seed s uses run s modulo their number, and seeds that share a run learn together.
+    """
     answers = np.empty((len(seeds), len(tested), task.targets.shape[1]), np.float32)
     for run, array in enumerate(arrays[: len(seeds)]):
         mine = slice(run, None, len(arrays))
-        own = {"settings": settings, "memory": memory}
-        answers[mine] = probe(head, array, task, rows[mine], tested, seeds[mine], **own)
+        answers[mine] = probe(head, array, task, rows[mine], tested, seeds[mine], **how)
     return answers
 
 

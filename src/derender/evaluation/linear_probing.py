@@ -27,41 +27,15 @@ import torch
 from torch import nn
 
 from derender.baselines.controls import untrained_twin
+from derender.baselines.supervised import fresh_resnet18
 from derender.data import as_float
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    constant,
-    numbers_of,
-    resamples,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap, feature_rows
+from derender.evaluation import linear_probes as probes
 from derender.evaluation.controls import UNTRAINED, subject_and_controls
-from derender.evaluation.feature_rows import (
-    FeatureSource,
-    ModelSource,
-    Prepared,
-    check_lengths,
-    chosen_labels,
-    is_model,
-    opened,
-    prepare,
-)
-from derender.evaluation.linear_probes import (
-    HEADS,
-    PAPER_HEAD,
-    PROBES,
-    HeadSettings,
-    head_loss,
-    majority_answers,
-    probabilities,
-    probe_runs,
-)
-from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, linear_scores, task_of
+from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, mean_precision, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table, verdict_table
+from derender.evaluation.score_table import Column, Scores, ScoreTable, judged_tables
 from derender.features import model_fingerprint, named
 from derender.inputs import Progress, device_named
 from derender.model import Derenderer
@@ -72,16 +46,16 @@ LINEAR_COLUMNS = {
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
 FINETUNED, SUPERVISED = "fine-tuned", "ResNet-18, supervised"
-PROBE_NAMES = {**PROBES, FINETUNED: "the paper's head, encoders trained too"}
+PROBE_NAMES = {**probes.PROBES, FINETUNED: "the paper's head, encoders trained too"}
 
 
 def linear(
-    features: FeatureSource,
+    features: feature_rows.FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
     attributes: bool = False,
     counts: Sequence[int] = (100, 500, 1_000),
-    heads: Sequence[str] = HEADS,
+    heads: Sequence[str] = probes.HEADS,
     seeds: int = 5,
     test_fraction: float = 0.5,
     groups: str | None = None,
@@ -115,23 +89,22 @@ def linear(
     heads = (heads,) if isinstance(heads, str) else heads
     counts = (counts,) if isinstance(counts, int) else counts
     for head in heads:
-        named(PROBES, head, "head")
-    if finetune and not is_model(features):
+        named(probes.PROBES, head, "head")
+    if finetune and not feature_rows.is_model(features):
         raise ValueError("finetune trains the encoders: give a model and images")
     how = Options(untrained_seeds=untrained_seeds, **options)
     rows = subject_and_controls(features, how)
-    names, left_out = chosen_labels(rows[0].tables[0], label, attributes, least=2)
-    ready = prepare(rows, names, min_count=min_count, max_count=max_count)
+    names, left_out = feature_rows.chosen_labels(rows[0].tables[0], label, attributes, least=2)
+    ready = feature_rows.prepare(rows, names, min_count=min_count, max_count=max_count)
     result = compare_prepared(
-        ready, counts, how.seeds(seeds), how, heads=heads, settings=HeadSettings(epochs=epochs),
-        models={rows[0].name: [features]} if finetune and is_model(features) else {},
+        ready, counts, how.seeds(seeds), how, heads=heads, settings=probes.HeadSettings(epochs=epochs),
+        models={rows[0].name: [features]} if finetune and feature_rows.is_model(features) else {},
         test_fraction=test_fraction, groups=ready.table.label(groups) if groups else None,
     )  # fmt: skip
     tables, notes = linear_tables(result), [*how.notes, *left_out, how.memory.summary()]
     if ready.n_dropped:
-        notes.insert(
-            0, f"{ready.n_dropped:,} rows beyond {min_count} to {max_count or 'all'} rows of a class left out"
-        )
+        most = max_count or "all"
+        notes.insert(0, f"{ready.n_dropped:,} rows beyond {min_count} to {most} rows of a class left out")
         result = replace(result, n_dropped=result.n_dropped + ready.n_dropped)
     return Scores(tables, {**result.numbers(), "labels": names}, notes)
 
@@ -142,7 +115,11 @@ class LinearPart:
 
     head: str
     count: int
-    rows: tuple[ScoredRow, ...]
+    rows: tuple[bootstrap.ScoredRow, ...]
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything as JSON takes it."""
+        return {"head": self.head, "labels": self.count, "rows": bootstrap.numbers_of(self.rows)}
 
 
 @dataclass(frozen=True)
@@ -162,21 +139,18 @@ class LinearComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        parts = [
-            {"head": part.head, "labels": part.count, "rows": numbers_of(part.rows)} for part in self.parts
-        ]
-        return {**vars(self), "parts": parts}
+        return {**vars(self), "parts": [part.numbers() for part in self.parts]}
 
 
 def compare_prepared(
-    ready: Prepared,
+    ready: feature_rows.Prepared,
     counts: Sequence[int],
     seeds: Sequence[int],
     options: Options,
     *,
-    heads: Sequence[str] = HEADS,
-    settings: HeadSettings = PAPER_HEAD,
-    models: Mapping[str, Sequence[ModelSource]] | None = None,
+    heads: Sequence[str] = probes.HEADS,
+    settings: probes.HeadSettings = probes.PAPER_HEAD,
+    models: Mapping[str, Sequence[feature_rows.ModelSource]] | None = None,
     supervised: bool = False,
     **rows: Any,
 ) -> LinearComparison:
@@ -202,22 +176,26 @@ def compare_prepared(
         learn = partial(finetune, model, images, task, training, split.test, factors=chosen, **how)
         return options.memory.recall_one("finetuned", inputs, learn)
 
-    trained = trained_models(models or {}, seeds, options.device, supervised)
-    tuned = {
-        name: {
-            count: np.stack([learned(runs[at % len(runs)], count, at, name) for at in range(len(seeds))])
-            for count in split.train
-        }
-        for name, runs in trained.items()
-    }
+    opened = partial(feature_rows.opened, device=options.device)
+    trained = {name: list(map(opened, runs)) for name, runs in (models or {}).items()}
+    if ours := [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]:
+        trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
+    if supervised:
+        size, device = next(iter(trained.values()))[0].image_size, device_named(options.device)
+        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device) for seed in seeds]
+    tuned: dict[str, dict[int, np.ndarray]] = {name: {} for name in trained}
+    for name, runs in trained.items():
+        for count in split.train:
+            each = [learned(runs[at % len(runs)], count, at, name) for at in range(len(seeds))]
+            tuned[name][count] = np.stack(each)
+    again: dict[str, Any] = {"settings": settings, "memory": options.memory}
     for name in ready.controls if models else ():
         if not name.startswith(UNTRAINED):  # no encoder to train: the answers of the head alone
-            arrays, how = ready.features[name], (split.test, seeds, settings, options.memory)
-            tuned[name] = {n: probe_runs("linear", arrays, task, own, *how) for n, own in split.train.items()}
+            alone = partial(probes.probe_runs, "linear", ready.features[name], task, **again)
+            tuned[name] = {count: alone(own, split.test, seeds) for count, own in split.train.items()}
     return compare_linear(
         ready.features, task, split, seeds, controls=ready.controls, heads=heads, finetuned=tuned,
-        settings=settings, resample_count=options.resamples, memory=options.memory,
-        progress=options.stage("probing", "probes"),
+        resample_count=options.resamples, progress=options.stage("probing", "probes"), **again,
     )  # fmt: skip
 
 
@@ -228,10 +206,10 @@ def compare_linear(
     seeds: Sequence[int],
     *,
     controls: Collection[str] = (),
-    heads: Sequence[str] = HEADS,
+    heads: Sequence[str] = probes.HEADS,
     finetuned: Mapping[str, Mapping[int, np.ndarray]] | None = None,
-    settings: HeadSettings = PAPER_HEAD,
-    resample_count: int = RESAMPLES,
+    settings: probes.HeadSettings = probes.PAPER_HEAD,
+    resample_count: int = bootstrap.RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> LinearComparison:
@@ -242,9 +220,21 @@ def compare_linear(
     nothing. ``finetuned``, by name and number of labels (S, T, A) answers of fine-tuned models, are a further
     head. ``progress`` is called with (probes done, probes in all).
     """
-    check_lengths(features, len(task))
+    feature_rows.check_lengths(features, len(task))
     truth = task.targets[rows.test]
-    weights = np.concatenate(list(resamples(len(rows.test), resample_count)))
+    weights = bootstrap.once_and_resampled(len(rows.test), resample_count)
+
+    def scored(name: str, answers: np.ndarray) -> bootstrap.ScoredRow:
+        """Scores of (S, T, A) answers; average precision has no interval."""
+        counted = np.stack([count_scores(truth, answer, task.kind, weights) for answer in answers])
+        plain, drawn = counted[:, 0].astype(np.float64), counted[:, 1:].mean(axis=0)
+        both = enumerate(("accuracy", "balanced_accuracy"))
+        scores = {score: bootstrap.estimate(plain[:, at], drawn[:, at]) for at, score in both}
+        precisions = [mean_precision(truth, answer) for answer in answers]
+        scores["average_precision"] = bootstrap.constant(precisions, resample_count)
+        return bootstrap.ScoredRow(name, name in {*controls, "majority"}, len(answers), scores)
+
+    again: dict[str, Any] = {"settings": settings, "memory": memory}
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
     for head in (*heads, *([FINETUNED] if finetuned else [])):
         for count, own in rows.train.items():
@@ -252,30 +242,15 @@ def compare_linear(
             if head == FINETUNED:
                 answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
             for name, arrays in features.items() if head != FINETUNED else ():
-                answers[name] = probe_runs(head, arrays, task, own, rows.test, seeds, settings, memory)
+                answers[name] = probes.probe_runs(head, arrays, task, own, rows.test, seeds, **again)
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            answers["majority"] = majority_answers(task, own, len(truth))
-            scored = [
-                _row(name, name in controls or name == "majority", one, truth, task.kind, weights)
-                for name, one in answers.items()
-            ]
-            parts.append(LinearPart(head, count, with_verdicts(scored)))
+            answers["majority"] = probes.majority_answers(task, own, len(truth))
+            judged = bootstrap.with_verdicts([*map(scored, answers, answers.values())])
+            parts.append(LinearPart(head, count, judged))
     dropped = int((~task.known).sum())
     return LinearComparison(tuple(parts), task.kind, task.names, len(rows.test), dropped, tuple(seeds))
-
-
-def _row(
-    name: str, control: bool, answers: np.ndarray, truth: np.ndarray, kind: str, weights: np.ndarray
-) -> ScoredRow:
-    """Scores of (S, T, A) answers; average precision has no interval."""
-    runs = [linear_scores(truth, answer, kind) for answer in answers]
-    resampled = np.mean([count_scores(truth, answer, kind, weights) for answer in answers], axis=0)
-    plain = np.array([(run.accuracy, run.balanced_accuracy) for run in runs])
-    row = scored_row(name, control, ("accuracy", "balanced_accuracy"), plain, resampled)
-    precision = constant([run.average_precision for run in runs], len(weights))
-    return replace(row, scores={**row.scores, "average_precision": precision})
 
 
 def linear_tables(result: LinearComparison) -> list[ScoreTable]:
@@ -289,8 +264,7 @@ def linear_tables(result: LinearComparison) -> list[ScoreTable]:
         rows = f"{part.count:,} labelled rows"
         caption = f"{rows}, {PROBE_NAMES[part.head]}: {asked}"
         judged = f"{rows}, {part.head}: above the strongest control?"
-        tables.append(scored_table(caption, "features", part.rows, LINEAR_COLUMNS))
-        tables.append(verdict_table(part.rows, LINEAR_COLUMNS, judged))
+        tables += judged_tables(caption, "features", part.rows, LINEAR_COLUMNS, judged)
     return tables
 
 
@@ -303,7 +277,7 @@ def finetune(
     *,
     factors: Sequence[str] = ("geometry", "albedo"),
     seed: int = 0,
-    settings: HeadSettings = PAPER_HEAD,
+    settings: probes.HeadSettings = probes.PAPER_HEAD,
     progress: Progress | None = None,
 ) -> np.ndarray:
     """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
@@ -318,12 +292,9 @@ def finetune(
 
     def embed(numbers: np.ndarray) -> torch.Tensor:
         pictures = as_float(np.ascontiguousarray(images[numbers])).to(device)
-        parts = (
-            [net.encoder(pictures) for net in nets.values()]
-            if ours
-            else nets["whole"].embed(pictures).values()
-        )
-        return torch.cat([*parts], dim=1)
+        if ours:
+            return torch.cat([net.encoder(pictures) for net in nets.values()], dim=1)
+        return torch.cat([*nets["whole"].embed(pictures).values()], dim=1)
 
     generator = torch.Generator().manual_seed(seed)
     targets = torch.from_numpy(task.targets).float().to(device)
@@ -338,7 +309,7 @@ def finetune(
         order = torch.from_numpy(rows)[torch.randperm(len(rows), generator=generator)]
         for batch in order.split(settings.batch_size):
             logits, asked = head(embed(batch.numpy())), targets[batch.to(device)]
-            loss = head_loss(logits[None], asked[None], task.kind).sum()
+            loss = probes.head_loss(logits[None], asked[None], task.kind).sum()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
@@ -347,20 +318,5 @@ def finetune(
     nets.eval()
     with torch.inference_mode():
         parts = np.array_split(tested, max(1, len(tested) // 256))
-        return np.concatenate([probabilities(head(embed(part)), task.kind).cpu().numpy() for part in parts])
-
-
-def trained_models(
-    models: Mapping[str, Sequence[ModelSource]], seeds: Sequence[int], device: str, supervised: bool
-) -> dict[str, list[Any]]:
-    """By row name, the models to train: those given, untrained ones, and ResNet-18 with fresh weights."""
-    trained = {name: [opened(run, device) for run in runs] for name, runs in models.items()}
-    ours = [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]
-    if ours:
-        trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
-    if supervised:
-        from derender.baselines.supervised import fresh_resnet18
-
-        size = next(iter(trained.values()))[0].image_size
-        trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device_named(device)) for seed in seeds]
-    return trained
+        answers = (probes.probabilities(head(embed(part)), task.kind) for part in parts)
+        return np.concatenate([answer.cpu().numpy() for answer in answers])

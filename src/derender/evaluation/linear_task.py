@@ -162,10 +162,14 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
     Values and classes that no row has do not count.
     """
     accuracy, balanced = count_scores(targets, probabilities, kind, np.ones((1, len(targets)), np.float32))[0]
+    return LinearScores(float(accuracy), float(balanced), mean_precision(targets, probabilities))
+
+
+def mean_precision(targets: np.ndarray, probabilities: np.ndarray) -> float:
+    """Average precision of ``linear_scores``, 0 to 1, best 1; NaN where no row is positive."""
     columns = [(t, t >= 0, p) for t, p in zip(targets.T, probabilities.T, strict=True) if (t == 1).any()]
     precisions = [average_precision_score(truth[known], answer[known]) for truth, known, answer in columns]
-    precision = float(np.mean(precisions)) if precisions else float("nan")
-    return LinearScores(float(accuracy), float(balanced), precision)
+    return float(np.mean(precisions)) if precisions else float("nan")
 
 
 def count_scores(

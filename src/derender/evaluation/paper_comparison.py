@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from derender.data import ImageSet
-from derender.evaluation.clustering import clustering_table, compare_clusterings
+from derender.evaluation.clustering import clustering_tables, compare_clusterings
 from derender.evaluation.clustering_methods import METHODS
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.controls import with_controls
@@ -18,14 +18,7 @@ from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_mo
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
-from derender.evaluation.score_table import (
-    Column,
-    Scores,
-    ScoreTable,
-    interval_column,
-    interval_of,
-    verdict_table,
-)
+from derender.evaluation.score_table import Column, Scores, ScoreTable, interval_column, interval_of
 from derender.evaluation.segmentation import SegmentSettings, segment
 from derender.features import named
 from derender.inputs import as_model
@@ -143,8 +136,7 @@ def compare(
             caption = f"{part.name}, {beside} ({METHODS[method]})"
             tables += [
                 beside_the_paper(caption, shown, ours, quiet, part.paper, more["differs"]),
-                clustering_table(result),
-                verdict_table(result.rows, CLUSTER_COLUMNS, f"{part.name}: above the strongest control?"),
+                *clustering_tables(result, f"{part.name}: above the strongest control?"),
             ]
             if ready.n_dropped:
                 notes.append(

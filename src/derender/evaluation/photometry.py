@@ -20,14 +20,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from derender.baselines.controls import untrained_twin
+from derender.baselines.controls import LUMINANCE, untrained_twin
 from derender.data import ImageSet, read_ground_truth
 from derender.data.image_set import as_float
 from derender.evaluation.angles import agreement, agreement_table
-from derender.evaluation.bootstrap import ScoredRow, estimate, group_resamples, numbers_of
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
 from derender.evaluation.image_scores import binned_rows, image_rows, image_verdicts
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import reconstruction_scores
@@ -41,7 +40,7 @@ from derender.photo import PhotoDetail, editable_scenes
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
-LUMA = np.array([0.299, 0.587, 0.114])
+LUMA = np.array(LUMINANCE)
 _LIGHT = Column("light r", None, note="correlation of mean shading with true brightness of albedo, best 0")
 _CHROMA = Column("chroma error", "low", 4, "distance of mean colours divided by their sums, best 0")
 _SHARE = Column("share", None, note="of the groups' difference in brightness that albedo takes, best 1")
@@ -87,7 +86,7 @@ def brightness(
     nothing = np.ones(len(mean))
     seen["image as albedo"] = {"albedo": seen["model"]["image"], "light": nothing}
     people = truth.labels.get("identity", np.arange(len(mean))).astype(str)
-    weights = group_resamples(people, how.resamples, how.seed)
+    weights = once_and_resampled(people, how.resamples, how.seed)
     caption = f"Brightness of albedo, 0 to 1: {len(mean):,} images of {len(set(people))} surfaces"
     bright = {name: one["albedo"] @ LUMA for name, one in seen.items()}
     table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
@@ -135,29 +134,29 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     if len(names) < 2:
         raise ValueError(f"{by!r} has {len(names)} groups: two or more are needed")
     seen = {name: surfaces(net, images.images, None, how.stage(name)) for name, net in nets.items()}
-    weights = group_resamples(np.arange(len(group)), how.resamples, how.seed).astype(np.float64)
-    once, member = np.ones((1, len(group))), (group[:, None] == names).astype(np.float64)
+    weights = once_and_resampled(len(group), how.resamples, how.seed).astype(np.float64)
+    member = (group[:, None] == names).astype(np.float64)
 
-    def means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def means(values: np.ndarray) -> np.ndarray:
         return (weights * values) @ member / np.maximum(weights @ member, 1e-9)
 
-    def share(bright: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        own, shown = (np.log(np.maximum(means(one, weights), 1e-6)) for one in (bright, picture))
+    def share(bright: np.ndarray) -> Estimate:
+        own, shown = (np.log(np.maximum(means(one), 1e-6)) for one in (bright, picture))
         own, shown = (one - one.mean(axis=1, keepdims=True) for one in (own, shown))
-        return (own * shown).sum(axis=1) / (shown * shown).sum(axis=1)
+        values = (own * shown).sum(axis=1) / (shown * shown).sum(axis=1)
+        return estimate(values[:1], values[1:])
 
     picture = seen["model"]["image"] @ LUMA
     shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
-    result = {what: (means(one, once)[0], means(one, weights)) for what, one in shown.items()}
+    result = {what: means(one) for what, one in shown.items()}
     groups = []
     for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True)):
-        scores = {what: estimate([own[at]], drawn[:, at]) for what, (own, drawn) in result.items()}
+        scores = {what: estimate(own[:1, at], own[1:, at]) for what, own in result.items()}
         groups.append(ScoredRow(f"{name} ({int(number):,})", False, 1, scores))
     columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in result}
     columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
-    taken = {name: estimate(share(one, once), share(one, weights)) for name, one in answers.items()}
-    shares = [ScoredRow(name, at > 0, 1, {"share": one}) for at, (name, one) in enumerate(taken.items())]
+    shares = [ScoredRow(name, name != "model", 1, {"share": share(one)}) for name, one in answers.items()]
     caption = f"Brightness of {by}, {len(group):,} images"
     tables = [
         scored_table(caption, "prediction", shares, {"share": _SHARE}, deviations=()),
@@ -214,6 +213,9 @@ def relight(
     lit = list(zip(read.labels[NEEDED[1]].tolist(), read.labels[NEEDED[2]].tolist(), strict=True))
     place = {(person, light): row for row, (person, light) in enumerate(zip(who, lit, strict=True))}
     people, photos, rows = sorted(set(who.tolist())), as_float(large.images), []
+    down, across = (round(share * photos.shape[-1]) for share in BORDER.get(read.layout, (0, 0)))
+    photographed = torch.zeros(photos.shape[-2:])  # 1 where a photograph is not its border
+    photographed[down : len(photographed) - down, across : len(photographed) - across] = 1
     apart: dict[str, dict[str, list[np.ndarray]]] = {"PSNR": {}, "SSIM": {}}
     progress = how.stage("relighting", "people")
     for number, person in enumerate(people):
@@ -231,7 +233,8 @@ def relight(
             target = scenes[[source] * len(lent)].with_parameters(light=scenes.light[lent])
             edited = PhotoDetail(photos[source], scenes[source], model.fov_deg)(target)
             rendered = model.render(at_size(target, photos.shape[-1]))
-            mask = _mask(model, scenes[source], photos.shape[-1], read.layout)
+            drawn = model.render(at_size(scenes[source], photos.shape[-1])).mask > 0.5
+        mask = drawn.float().cpu() * photographed
         answers = (
             edited.image,
             rendered.image,
@@ -260,12 +263,3 @@ def relight(
         values[title.lower()] = numbers_of(scored)
         notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": columns["all"]})]
     return Scores(tables, values, notes)
-
-
-def _mask(model: Derenderer, scene: Scene, size: int, layout: str) -> Float[Tensor, "1 s s"]:
-    """Where the model draws a surface into the photograph, 0 or 1."""
-    mask = (model.render(at_size(scene, size)).mask > 0.5).float().cpu()
-    down, across = (round(share * size) for share in BORDER.get(layout, (0, 0)))
-    inner = torch.zeros_like(mask)
-    inner[:, down : size - down, across : size - across] = 1
-    return mask * inner

@@ -16,13 +16,15 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
+from sklearn.decomposition import PCA
 from torch import Tensor
 
-from derender.evaluation.image_scores import ImageResult
+from derender.baselines.controls import flat_pixels
+from derender.evaluation.image_scores import ImageResult, means_and_each
 from derender.evaluation.score_table import Column
 from derender.features import Progress, map_batches
 
-COMPONENTS = 64
+COMPONENTS, COMPONENT_IMAGES = 64, 2_000
 WINDOW = 11
 
 
@@ -89,17 +91,9 @@ def reconstruction_scores(
     difference = torch.where(weight > 0, prediction.double() - target.double(), 0.0)
     l1 = (weight * difference.abs()).sum(dim=(1, 2, 3)) / total
     psnr = -10 * ((weight * difference.square()).sum(dim=(1, 2, 3)) / total).log10()
-    ssim = masked_ssim(prediction, target, mask)
-    return ReconstructionScores(
-        l1=l1.nanmean().item(),
-        psnr_db=psnr.nanmean().item(),
-        coverage=mask.double().mean().item(),
-        n_empty=int((total == 0).sum()),
-        l1_each=l1.numpy(force=True),
-        psnr_db_each=psnr.numpy(force=True),
-        ssim=ssim.nanmean().item(),
-        ssim_each=ssim.numpy(force=True),
-    )
+    scores = means_and_each(l1=l1, psnr_db=psnr, ssim=masked_ssim(prediction, target, mask))
+    coverage, n_empty = mask.double().mean().item(), int((total == 0).sum())
+    return ReconstructionScores(coverage=coverage, n_empty=n_empty, **scores)
 
 
 def mean_image(images: np.ndarray) -> Float[Tensor, "3 h w"]:
@@ -148,14 +142,16 @@ def component_count(images: int, most: int = COMPONENTS) -> int:
     return max(1, min(most, images // 4))
 
 
+def evenly(count: int, most: int = COMPONENT_IMAGES) -> np.ndarray:
+    """At most so many of ``count`` row numbers, evenly apart."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
+
+
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:
     """uint8 images (N, 3, H, W) from the principal components of (M, 3, H, W) others alone, in 0..1."""
-    from sklearn.decomposition import PCA
-
-    known, flat = (np.asarray(one, np.float32).reshape(len(one), -1) / 255 for one in (fitted, images))
     with np.errstate(invalid="ignore"):  # a single image has no variance
-        pca = PCA(component_count(len(fitted)), random_state=0).fit(known)
-    again = pca.inverse_transform(pca.transform(flat)).astype(np.float32)
+        pca = PCA(component_count(len(fitted)), random_state=0).fit(flat_pixels(fitted))
+    again = pca.inverse_transform(pca.transform(flat_pixels(images))).astype(np.float32)
     return torch.from_numpy(again).clamp(0, 1).reshape(images.shape)
 
 

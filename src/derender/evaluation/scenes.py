@@ -21,13 +21,12 @@ from derender.evaluation.depth import GeometryResult, evaluate_geometry
 from derender.evaluation.factors import FactorResult, evaluate_factors
 from derender.evaluation.image_scores import ImageResult, image_verdicts
 from derender.evaluation.memory import Memory
-from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, mean_image
+from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, evenly, mean_image
 from derender.evaluation.score_table import Scores
 from derender.features import Progress, embed_images, model_fingerprint
 from derender.inputs import as_images, as_model
 from derender.model import Derenderer
 
-COMPONENT_IMAGES = 2_000
 Protocols = dict[str, tuple[type[ImageResult], Callable[[], Any]]]
 """By name the class of the result, and a call that makes it."""
 
@@ -104,19 +103,18 @@ def reconstruction(
     model = as_model(model)
     images = as_images(images, model.image_size)
     known = (training_images or images).images
-    chosen = known[np.linspace(0, len(known) - 1, min(len(known), COMPONENT_IMAGES)).astype(int)]
 
     def make() -> ReconstructionResult:
         return evaluate_reconstruction(
-            optimised(model, fit_steps), images.images, mean=mean_image(known), components_of=chosen,
-            untrained=untrained_twin(model, seed), batch_size=batch_size, progress=progress,
+            optimised(model, fit_steps), images.images, mean=mean_image(known),
+            components_of=known[evenly(len(known))], untrained=untrained_twin(model, seed),
+            batch_size=batch_size, progress=progress,
         )  # fmt: skip
 
     inputs = {"images": images.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0}
     result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, resample_count, memory)
-    return replace(
-        result, values={**result.values, "intervals": result.values["intervals"]["reconstruction"]}
-    )
+    intervals = result.values["intervals"]["reconstruction"]
+    return replace(result, values={**result.values, "intervals": intervals})
 
 
 def _scored(

@@ -276,6 +276,13 @@ def verdict_table(rows: Sequence[ScoredRow], columns: Mapping[str, Column], capt
     return ScoreTable(caption, "features: score", VERDICT_COLUMNS, results)
 
 
+def judged_tables(
+    caption: str, first: str, rows: Sequence[ScoredRow], columns: Mapping[str, Column], asked: str, **how: Any
+) -> list[ScoreTable]:
+    """The table of scored rows, whose arguments ``how`` are, and that of verdicts, captioned ``asked``."""
+    return [scored_table(caption, first, rows, columns, **how), verdict_table(rows, columns, asked)]
+
+
 def verdict(row: ScoredRow, score: str) -> str:
     """In words: whether a row is above the strongest control in one score."""
     own, one = row.scores[score], row.versus.get(score)

@@ -24,7 +24,7 @@ from pydantic_core import to_jsonable_python
 from derender.baselines import CONTROLS, control_features, open_baseline
 from derender.data import ImageSet
 from derender.data.source import stamps_of
-from derender.evaluation.clustering import clustering_table, compare_clusterings
+from derender.evaluation.clustering import clustering_tables, compare_clusterings
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.controls import architecture, control_rows
 from derender.evaluation.feature_rows import FeatureRow, chosen_labels, prepare
@@ -32,7 +32,7 @@ from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_prepared,
 from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options, aligned
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES
-from derender.evaluation.score_table import Row, Scores, ScoreTable, verdict_table
+from derender.evaluation.score_table import Row, Scores, ScoreTable
 from derender.features import FeatureTable, embed
 from derender.inputs import as_images, as_model, split_of
 from derender.learn.plan import OURS, WITHOUT_LOOP, ImageSource, Plan, ScoredSet, read_plan
@@ -221,8 +221,7 @@ class Sweep:
                         ready.features, ready.labels, controls=ready.controls, method=plan.clustering,
                         resample_count=plan.resamples, memory=how.memory,
                     )  # fmt: skip
-                    verdicts = verdict_table(result.rows, CLUSTER_COLUMNS, "above the strongest control?")
-                    own = [clustering_table(result), verdicts]
+                    own = clustering_tables(result, "above the strongest control?")
                 else:
                     result = compare_prepared(ready, plan.counts, how.seeds(plan.draws), how)
                     own = linear_tables(result)

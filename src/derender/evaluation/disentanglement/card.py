@@ -144,11 +144,8 @@ class DisentanglementCard:
         if truth.by_dimension is not None:
             results.append(self._means(f"Single dimensions, as published, mean over {seeds}", _DIMENSIONS))
         together = {name: f"all, {name.split()[0]}" for name in self.rows} | {MODEL: "all"}
-        cells = [
-            *self.mean("truth.score"),
-            *(self.mean("truth.together", name) for name in together),
-            truth.chance,
-        ]
+        all_of_them = (self.mean("truth.together", name) for name in together)
+        cells = [*self.mean("truth.score"), *all_of_them, truth.chance]
         caption = "True factors from features, held out: R2 of light and camera, accuracy of classes; best 1"
         columns = [Column(head, None, 2) for head in (*self.features, *together.values(), "chance")]
         rows = [Row(*row) for row in zip(truth.factors, np.stack(cells, axis=1).tolist(), strict=True)]
@@ -246,7 +243,7 @@ def disentangle(
         return pca_features(images, components=max(len(sizes), min(64, len(images) // 4))).concatenate()
 
     def made(row: str, seed: int) -> FeatureScores:
-        swap, truth, net = None, None, {MODEL: model}.get(row)
+        swap, truth, net = None, None, model if row == MODEL else None
         if row == "untrained encoder":
             net = untrained_twin(model, seed)
             blocks = embed_images(net, pixels, batch_size=batch_size)
@@ -257,7 +254,7 @@ def disentangle(
             equal = [len(part) for part in np.array_split(components()[0], len(sizes))]
             blocks = dict(zip(sizes, dealt(components(), equal, seed), strict=True))
         else:
-            blocks = features() if net is model else shuffled_rows(features(), seed)
+            blocks = features() if row == MODEL else shuffled_rows(features(), seed)
         if net is not None:
             chosen = np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
             swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size)
@@ -270,9 +267,8 @@ def disentangle(
     for seed in seeds:
         for name, result in rows.items():
             keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_images}
-            result.append(
-                kept.recall_value("card", {**inputs, **keys}, FeatureScores, partial(made, name, seed))
-            )
+            make = partial(made, name, seed)
+            result.append(kept.recall_value("card", {**inputs, **keys}, FeatureScores, make))
             if progress is not None:
                 progress(sum(map(len, rows.values())), len(seeds) * len(rows))
     card = DisentanglementCard(tuple(sizes), rows, correlations, tuple(sizes.values()), len(images))

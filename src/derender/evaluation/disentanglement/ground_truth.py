@@ -144,10 +144,9 @@ def ground_truth_scores(
     if dimensions is not None:
         weights, each = importance(everything, factors), binned(everything)
         single = np.stack([_explained(everything, factor) for factor in factors], axis=1)
-        gaps = [_information_gap(each, factor) for factor in factors], _gap(single)
-        by_dimension = ModularityScores(
-            *dci(weights), informativeness, *(float(np.mean(one)) for one in gaps)
-        )
+        own_mig = float(np.mean([_information_gap(each, factor) for factor in factors]))
+        sap = float(np.mean(_gap(single)))
+        by_dimension = ModularityScores(*dci(weights), informativeness, own_mig, sap)
     return GroundTruthScores(
         names,
         tuple(factor.name for factor in factors),
@@ -167,12 +166,21 @@ def importance(codes: np.ndarray, factors: Sequence[TrueFactor]) -> np.ndarray:
     helps. The penalty is a fixed share of the largest useful one, so scaling codes or factors changes
     nothing; a rotation does.
     """
+    from sklearn.linear_model import lasso_path
+
     deviation = codes.std(axis=0)
     alive = deviation > 1e-9 * np.abs(codes).max(axis=0, initial=0)
     standard = (codes[:, alive] - codes[:, alive].mean(axis=0)) / deviation[alive]
     result = np.zeros((codes.shape[1], len(factors)))
+    gram = standard.T @ standard
+    how: dict[str, Any] = {"alphas": LASSO_PENALTIES, "tol": TOLERANCE, "max_iter": 5000, "precompute": gram}
     for column, factor in enumerate(factors if alive.any() else []):
-        weights = _lasso(standard, factor)
+        weights = np.zeros(len(gram))
+        for target in (factor.targets - factor.targets.mean(axis=0)).T:
+            along = standard.T @ target
+            if (largest := np.abs(along).max() / len(codes)) > 0:
+                path = lasso_path(standard, target / largest, Xy=along / largest, **how)[1]
+                weights += np.abs(path[:, -1]) * largest
         result[alive, column] = weights / (weights.sum() or 1)
     return result
 
@@ -239,21 +247,6 @@ def _predicted(x: np.ndarray, factors: Sequence[TrueFactor], seed: int) -> Itera
             score = float(1 - left / total)
         results.append((score, max(0.0, (score - largest) / (1 - largest)), bins))
     return zip(*results, strict=True)
-
-
-def _lasso(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:
-    """Sum over the factor's targets of absolute lasso weights, by cyclic coordinate descent."""
-    from sklearn.linear_model import lasso_path
-
-    how: dict[str, Any] = {"alphas": LASSO_PENALTIES, "tol": TOLERANCE, "max_iter": 5000}
-    gram, weights = codes.T @ codes, np.zeros(codes.shape[1])
-    for target in (factor.targets - factor.targets.mean(axis=0)).T:
-        along = codes.T @ target
-        largest = np.abs(along).max() / len(codes)
-        if largest > 0:
-            how |= {"precompute": gram, "Xy": along / largest}
-            weights += np.abs(lasso_path(codes, target / largest, **how)[1][:, -1]) * largest
-    return weights
 
 
 def _explained(codes: np.ndarray, factor: TrueFactor) -> np.ndarray:

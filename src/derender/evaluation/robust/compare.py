@@ -7,6 +7,7 @@ the same for all features, angles and scores, so that differences are paired.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +15,9 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
-from derender.evaluation.bootstrap import (
-    RESAMPLES,
-    ScoredRow,
-    group_resamples,
-    numbers_of,
-    scored_row,
-    with_verdicts,
-)
+from derender.evaluation import bootstrap, feature_rows
 from derender.evaluation.controls import control_rows
-from derender.evaluation.feature_rows import (
-    FeatureRow,
-    ModelSource,
-    check_lengths,
-    chosen_labels,
-    embedded_table,
-    prepare,
-)
-from derender.evaluation.linear_probes import PAPER_HEAD, PROBES, majority_answers, probe_runs
+from derender.evaluation.linear_probes import PROBES, majority_answers, probe_runs
 from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
@@ -60,7 +46,7 @@ _LOST = Column("lost", None, note="ordinary less area; read it beside ordinary, 
 
 
 def robustness(
-    models: Mapping[str, ModelSource] | ModelSource,
+    models: Mapping[str, feature_rows.ModelSource] | feature_rows.ModelSource,
     images: ImageSet | str | Path | None = None,
     *,
     pictures: str | None = None,
@@ -129,10 +115,10 @@ def robustness(
         columns = FeatureTable(read.files, {"none": np.zeros((len(read), 1))}, table_labels(read))
         if not names and not attributes:
             names = [name for name in ("identity", "class") if name in columns.labels][:1]
-        chosen, left_out = chosen_labels(columns, names, attributes, 2)
+        chosen, left_out = feature_rows.chosen_labels(columns, names, attributes, 2)
         how.notes.extend(left_out)
         sizes = {"min_count": min_count, "max_count": max_count}
-        ready = prepare([FeatureRow("images", (columns,))], chosen, **sizes)
+        ready = feature_rows.prepare([feature_rows.FeatureRow("images", (columns,))], chosen, **sizes)
         side = ready.table.label(groups) if groups else None
         read, task = how.at(first.image_size, ready.table.files), task_of(ready.labels)
         if way == "truth":
@@ -145,12 +131,12 @@ def robustness(
             )
     rows = []
     for name, net in nets.items():
-        table = embedded_table(net, trial.pictures, how.memory, how.stage(f"embedding {name}"))
+        table = feature_rows.embedded_table(net, trial.pictures, how.memory, how.stage(f"embedding {name}"))
         joined, prefix = " + ".join(how.chosen or table.factors), f"{name}: " if len(nets) > 1 else ""
-        rows.append(FeatureRow(f"{prefix}{joined}", (table,), how.chosen))
+        rows.append(feature_rows.FeatureRow(f"{prefix}{joined}", (table,), how.chosen))
         if len(rows) == 1:
             single = [one for one in table.factors if one != joined]
-            rows += [FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
+            rows += [feature_rows.FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
     learned_from = np.unique(np.concatenate([curve.learn for curve in trial.curves]))
     fit_on = trial.pictures.select(learned_from)
     rows += control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
@@ -178,9 +164,9 @@ class CurveResult:
     title: str
     levels: tuple[float, ...]
     n_tested: tuple[int, ...]
-    rows: Mapping[str, tuple[ScoredRow, ...]]
+    rows: Mapping[str, tuple[bootstrap.ScoredRow, ...]]
 
-    def values(self, row: ScoredRow) -> list[float]:
+    def values(self, row: bootstrap.ScoredRow) -> list[float]:
         """The curve itself: one score for each angle."""
         return [row.scores[level_name(level)].value for level in self.levels]
 
@@ -207,7 +193,8 @@ class RobustnessComparison:
         curves = {}
         for curve in self.curves:
             facts = {"title": curve.title, "levels_deg": curve.levels, "n_tested": curve.n_tested}
-            curves[curve.name] = facts | {score: numbers_of(rows) for score, rows in curve.rows.items()}
+            scores = {score: bootstrap.numbers_of(rows) for score, rows in curve.rows.items()}
+            curves[curve.name] = facts | scores
         return {**vars(self), "curves": curves}
 
     def tables(self, score: str = "accuracy") -> list[ScoreTable]:
@@ -259,7 +246,7 @@ def compare_robustness(
     *,
     controls: Collection[str] = (),
     head: str = "logistic",
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     seed: int = 0,
     memory: Memory | None = None,
     progress: Progress | None = None,
@@ -272,10 +259,35 @@ def compare_robustness(
     called with (probes done, probes in all).
     """
     task = trial.task
-    check_lengths(features, len(task))
+    feature_rows.check_lengths(features, len(task))
     if not features or not all(features.values()) or not len(seeds):
         raise ValueError("a comparison needs one array of features in each row, and a seed")
     tested = np.unique(np.concatenate([rows for curve in trial.curves for rows in curve.points]))
+
+    def scored(curve: Curve, answers: Mapping[str, np.ndarray]) -> dict[str, tuple[bootstrap.ScoredRow, ...]]:
+        """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
+        truths = [task.targets[rows] for rows in curve.points]
+        places = [np.searchsorted(tested, rows) for rows in curve.points]
+        units = [trial.unit[rows] for rows in curve.points]
+        draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
+        starts = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
+        weights = list(map(bootstrap.once_and_resampled, units, repeat(resample_count), starts))
+        names = (ORDINARY, AREA, *map(level_name, curve.levels))
+
+        def scores(run: np.ndarray) -> np.ndarray:
+            """(1 + B, 1 + points, 2) both scores, the area second."""
+            asked = zip(truths, places, weights, strict=True)
+            ordinary, *levels = (count_scores(truth, run[at], task.kind, own) for truth, at, own in asked)
+            area = area_under(curve.levels, np.stack(levels, axis=-1))
+            return np.stack((ordinary, area, *levels), axis=1)
+
+        result: dict[str, list[bootstrap.ScoredRow]] = {score: [] for score in SCORES}
+        for name, runs in answers.items():
+            both = np.stack([scores(run) for run in runs])
+            for at, rows in enumerate(result.values()):
+                rows.append(bootstrap.scored_row(name, name in {*controls, "majority"}, names, both[..., at]))
+        return {score: bootstrap.with_verdicts(rows) for score, rows in result.items()}
+
     known: dict[bytes, dict[str, np.ndarray]] = {}  # answers by training rows: most curves share these
     total, curves, n_learned = len({one.learn.tobytes() for one in trial.curves}) * len(features), [], {}
     for curve in trial.curves:
@@ -284,48 +296,12 @@ def compare_robustness(
         answers = known.setdefault(curve.learn.tobytes(), {})
         if not answers:
             for name, arrays in features.items():
-                answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, PAPER_HEAD, memory)
+                answers[name] = probe_runs(head, arrays, task, draws, tested, seeds, memory=memory)
                 if progress is not None:
                     progress(sum(map(len, known.values())), total)
         both = {**answers, "majority": majority_answers(task, draws, len(tested))}
-        rows = _scored(curve, trial, both, tested, {*controls, "majority"}, resample_count, seed)
         sizes = tuple(map(len, curve.points))
-        curves.append(CurveResult(curve.name, curve.title, curve.levels, sizes, rows))
+        curves.append(CurveResult(curve.name, curve.title, curve.levels, sizes, scored(curve, both)))
     return RobustnessComparison(
         tuple(curves), trial.how, task.kind, task.names, head, n_learned, trial.n_dropped, tuple(seeds)
     )
-
-
-def _scored(
-    curve: Curve,
-    trial: Trial,
-    answers: Mapping[str, np.ndarray],
-    tested: np.ndarray,
-    controls: Collection[str],
-    count: int,
-    seed: int,
-) -> dict[str, tuple[ScoredRow, ...]]:
-    """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
-    truths = [trial.task.targets[rows] for rows in curve.points]
-    places = [np.searchsorted(tested, rows) for rows in curve.points]
-    units = [trial.unit[rows] for rows in curve.points]
-    draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
-    seeds = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
-    drawn = [group_resamples(own, count, one) for own, one in zip(units, seeds, strict=True)]
-    weights = [np.concatenate((np.ones_like(own[:1]), own)) for own in drawn]  # first every row once
-    names = (ORDINARY, AREA, *map(level_name, curve.levels))
-
-    def scores(run: np.ndarray) -> np.ndarray:
-        """(1 + B, 1 + points, 2) both scores, the area second."""
-        asked = zip(truths, places, weights, strict=True)
-        ordinary, *levels = (count_scores(truth, run[at], trial.task.kind, own) for truth, at, own in asked)
-        area = area_under(curve.levels, np.stack(levels, axis=-1))
-        return np.stack((ordinary, area, *levels), axis=1)
-
-    result: dict[str, list[ScoredRow]] = {score: [] for score in SCORES}
-    for name, runs in answers.items():
-        both = np.stack([scores(run) for run in runs])
-        plain, resampled = both[:, 0], both[:, 1:].mean(axis=0)
-        for at, rows in enumerate(result.values()):
-            rows.append(scored_row(name, name in controls, names, plain[..., at], resampled[..., at]))
-    return {score: with_verdicts(rows) for score, rows in result.items()}

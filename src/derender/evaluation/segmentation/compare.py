@@ -8,7 +8,7 @@ image by image and added up before they are divided. A class that no tested mask
 mean; answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from derender.data import read_masks
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, resamples, scored_row, with_verdicts
+from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, once_and_resampled, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
-from derender.evaluation.score_table import Cell, Column, Row, Scores, ScoreTable, scored_table, verdict_table
+from derender.evaluation.pixels import evenly
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmentation import nets
 from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
 from derender.evaluation.segmentation.nets import SegmentSettings
@@ -103,10 +104,9 @@ class SegmentationComparison:
             f"{count} seed{'s' if count > 1 else ''}"
         )
         trainable = {row.scored.name: row.trainable for row in self.rows}
-        learn: Mapping[Column, Callable[[ScoredRow], Cell]] = {
-            Column("learn", note="number of trained weights"): lambda row: trainable[row.name] or None
-        }
-        tables = [scored_table(caption, "net", scored, COLUMNS, more=learn)]
+        learn = Column("learn", note="number of trained weights")
+        more = {learn: lambda row: trainable[row.name] or None}
+        tables = [scored_table(caption, "net", scored, COLUMNS, more=more)]
         if any(row.versus for row in scored):
             tables.append(verdict_table(scored, COLUMNS, "above the strongest control?"))
         learning = [row for row in self.rows if row.trainable]
@@ -174,7 +174,7 @@ def segment(
     check_size(model, data.images)
     settings, memory = settings or SegmentSettings(), memory or Memory()
     settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
-    shown = data.test[np.linspace(0, len(data.test) - 1, min(SHOWN, len(data.test))).astype(int)]
+    shown = data.test[evenly(len(data.test), SHOWN)]
     content = content_hash({name: getattr(data, name) for name in ("images", "masks", "train", "test")})
     same = {"data": content, "classes": len(data.classes)}
     each = settings.epochs * len(data.train)
@@ -191,14 +191,13 @@ def segment(
         losses = nets.train_segmenter(net, data, seed, settings, step)
         return {**counted(nets.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
-    drawn = np.concatenate(list(resamples(len(data.test), resample_count)))
-    weights = np.concatenate((np.ones_like(drawn[:1]), drawn))  # first every image once
+    weights = once_and_resampled(len(data.test), resample_count)
 
     def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
         result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
         iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
         losses = np.array([run["losses"] for run in runs if trainable])
-        scored = scored_row(title, control, tuple(COLUMNS), result[:, 0], result[:, 1:].mean(axis=0))
+        scored = scored_row(title, control, COLUMNS, result)
         return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
     rows = []

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int64, UInt8
+from sklearn.decomposition import PCA
 
+from derender.baselines.controls import flat_pixels
 from derender.data import ImageSet, split_indices
-from derender.evaluation.pixels import component_count
+from derender.evaluation.pixels import component_count, evenly
 
 TEST_FRACTION = 0.2
-COMPONENT_IMAGES = 2_000
 _CHUNK = 512
 
 
@@ -102,19 +103,14 @@ def by_components(data: SegmentationData) -> np.ndarray:
     64 components (a quarter of the training images, where that is fewer) of at most 2,000 training images.
     Scaling them would change nothing. Of two even classes the lower.
     """
-    from sklearn.decomposition import PCA
-
-    def flat(rows: np.ndarray) -> np.ndarray:
-        return data.images[rows].reshape(len(rows), -1).astype(np.float32) / 255
 
     def described(rows: np.ndarray) -> np.ndarray:
         parts = np.array_split(rows, max(1, len(rows) // _CHUNK))
-        return np.column_stack(
-            (np.ones(len(rows)), np.concatenate([pca.transform(flat(part)) for part in parts]))
-        )
+        codes = [pca.transform(flat_pixels(data.images[part])) for part in parts]
+        return np.column_stack((np.ones(len(rows)), np.concatenate(codes)))
 
-    places = np.linspace(0, len(data.train) - 1, min(len(data.train), COMPONENT_IMAGES)).astype(int)
-    pca = PCA(component_count(len(data.train)), random_state=0).fit(flat(data.train[places]))
+    fitted = flat_pixels(data.images[data.train[evenly(len(data.train))]])
+    pca = PCA(component_count(len(data.train)), random_state=0).fit(fitted)
     learned = data.masks[data.train].reshape(len(data.train), -1)
     solver, tested = np.linalg.pinv(described(data.train)), described(data.test)
     best = np.zeros((len(data.test), learned.shape[1]), np.uint8)
