@@ -1,13 +1,16 @@
 """Joint training on the command line: from a run and from nothing, resumed, scored, and got wrong."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 import yaml
+from PIL import Image
 from tests.cli.conftest import TINY, run, settings
 
 from derender import FeatureTable
+from derender.inputs import split_of
 
 STEPS = ["images=16", "batch_size=8"]
 
@@ -54,7 +57,15 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
     assert json.loads(shown.out)["scores"] == told
     assert run(*words, "--resume", "--force") == 0
     resume = ("-d", faces, "--resume", "--out")
-    assert "leave out weight" in refused("finetune", *resume, out, "--weight", 3)
+    assert split_of(out / "model") == split_of(out) is not None, "as models of derender train do"
+    assert refused("finetune", *resume, out, "--weight", 3).endswith("leave out weight")
+    other = (*words[1:], "--resume", "--force", "--factors", "albedo", "--set", "seed=1")
+    assert refused("finetune", *other).endswith(": leave out factors, seed=1")
+    assert refused("finetune", *resume, out, "--rendering-weight", 0).endswith("leave out rendering_weight")
+    moved = shutil.copytree(faces, tmp_path / "moved")
+    for file in (moved / "images").iterdir():
+        Image.eval(Image.open(file), lambda level: 255 - level).save(file)
+    assert "not on these 40" in refused("finetune", "-d", moved, *resume[2:], out)
     assert "continue with derender finetune --resume" in refused("train", *resume, out)
     assert "continue with derender train --resume" in refused("finetune", *resume, begun)
 

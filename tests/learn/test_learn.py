@@ -1,5 +1,7 @@
 """The library calls that make models, on values and on addresses, without a command."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,9 @@ def test_a_run_is_a_model_with_a_page_and_goes_on(run, images):
     assert more.images == 16, "its own settings: there is nothing to do"
     with pytest.raises(ValueError, match=r"on 40 images .*not on these 30 .*start_from"):
         derender.train(images.select(slice(30)), out=run, resume=True, device="cpu")
+    for others in (replace(images, images=255 - images.images), replace(images, files=images.files[::-1])):
+        with pytest.raises(ValueError, match=r"on 40 images .*not on these 40"):
+            derender.train(others, out=run, resume=True, device="cpu")
     with pytest.raises(FileExistsError, match="is not empty"):
         derender.train(images, out=run, settings=TINY)
     with pytest.raises(FileNotFoundError, match="train without resume first"):

@@ -114,7 +114,7 @@ def test_settings_of_a_run_name_renderer_and_factors():
 def test_a_run_is_resumed_with_its_renderer(tmp_path):
     (tmp_path / "config.yaml").write_text(to_yaml(run_settings(preset="small", renderer="phong+haze")))
     with pytest.raises(ValueError, match=r"trained with another model\.renderer \(phong\+haze, now haze\)"):
-        reopen_run(tmp_path, run_settings(preset="small", renderer="haze"))
+        reopen_run(tmp_path, run_settings(preset="small", renderer="haze"), {})
 
 
 def _scene(**extra) -> Scene:

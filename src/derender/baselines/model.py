@@ -22,7 +22,14 @@ from derender.baselines import network_type
 from derender.data import ImageSet, check_images, split_indices
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
-from derender.storage.folder import FORMAT, naming_damage, read_weights, saved_config
+from derender.storage.folder import (
+    FORMAT,
+    SplitRecord,
+    naming_damage,
+    read_weights,
+    saved_config,
+    write_split,
+)
 from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE, require_known
 from derender.storage.tensors import write_tensors
 from derender.training import config as configs
@@ -261,7 +268,7 @@ class ShortRun:
             raise ValueError(
                 f"{config.baseline} trains in minutes and is not resumed: train it again into another folder"
             )
-        self.split = split_indices(images.files, config.split, seed=config.seed)
+        self.config, self.split = config, split_indices(images.files, config.split, seed=config.seed)
         data = run_folder.describe_data(images, self.split)
         self.folder = run_folder.start_run(Path(out), config, data, accelerator)
         self.report, self.began = progress or (lambda _: None), time.perf_counter()
@@ -284,6 +291,7 @@ class ShortRun:
         """Save the model; ``numbers`` are the last scores by name."""
         seconds = self.seconds
         model.save(self.folder.model)
+        write_split(self.folder.model, SplitRecord(self.config.split, self.config.seed))
         return loop.TrainResult(self.folder.path, images, seconds, images / seconds, numbers, "images", ())
 
 

@@ -1,7 +1,6 @@
 """Training runs: settings from every source, and the calls that train a model or a baseline, or finetune."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from derender.evaluation.finetuning import FinetuneTask, load_finetuned, score_f
 from derender.evaluation.memory import Memory
 from derender.evaluation.score_table import Scores
 from derender.inputs import as_images, as_model, device_named
-from derender.storage.bounded import parse_json, read_text
 from derender.training import derender_task
 from derender.training.config import PRESETS, FinetuneConfig, TrainConfig, as_overrides, resolve, with_changes
 from derender.training.distributed import leave, open_fabric, this_rank_writes
@@ -111,13 +109,6 @@ def train(
     with fabric.rank_zero_first(local=True):
         reading = Progress.of("reading", report)
         images = as_images(images, image_size_of(config), dataset=dataset, limit=limit, progress=reading)
-    if resume and (file := out / "environment.json").is_file():
-        began = parse_json(read_text(file), dict[str, Any]).get("data", {})
-        if began and (began.get("layout"), began.get("pictures")) != (images.layout, len(images)):
-            raise ValueError(
-                f"{out} was trained on {began.get('pictures')} images ({began.get('layout')}), not on these "
-                f"{len(images)} ({images.layout}): resume with the same, or start a new run with start_from"
-            )
     if on_images is not None:
         on_images(images)
     ours = isinstance(config, TrainConfig)
@@ -153,6 +144,9 @@ class Finetuned:
     start: str | None
 
 
+_TARGET = ("labels", "factors", "weight", "rendering_weight", "labelled")
+
+
 def finetune_settings(
     out: str | Path, *, model: str | Path | None = None, preset: str | None = None,
     labels: Sequence[str] | None = None, attributes: bool = False,
@@ -168,18 +162,18 @@ def finetune_settings(
         config = read_any_config(Path(out))
         if not isinstance(config, FinetuneConfig):
             raise ValueError(f"{out} was made by derender train: continue with derender train --resume")
-        given = {name: value for name, value in names.items() if name not in ("out", "resume") and value}
-        with suppress(ValueError):
-            labels = config.target.labels if attributes else None
-            if not given or with_changes(finetune_settings(out, **given), target__labels=labels) == config:
-                return config
-        raise ValueError(f"a resumed run keeps its settings: leave out {', '.join(given)}")
+        start = {"model": config.start, "preset": None if config.start else config.preset}
+        differ = [key for key, value in start.items() if names[key] is not None and str(names[key]) != value]
+        given = [(key, {key: names[key]}) for key in _TARGET if names[key] is not None]
+        given += [(text, {"settings": [text]}) for text in texts_of(settings or ())]
+        differ += [key for key, change in given if _changed(config, **change) != config]
+        if differ:
+            raise ValueError(f"a resumed run keeps its settings: leave out {', '.join(differ)}")
+        return config
     if model is not None and preset is not None:
         raise ValueError("preset is for fresh weights, model for given ones: give one of them")
     if bool(labels) == attributes:
         raise ValueError("give either labels or attributes")
-    if isinstance(factors, str):
-        factors = [name.strip() for name in factors.split(",")]
     if model is None:
         config = FinetuneConfig(**resolve(preset or "faces").model_dump(mode="json"))
     else:
@@ -189,10 +183,21 @@ def finetune_settings(
         values = config.model_dump(mode="json", include=kept)
         start = as_model(model, device="cpu")
         config = FinetuneConfig(**values, model=start.settings, start=str(model))
+    given = {key: names[key] for key in _TARGET}
+    return _changed(config, settings=settings or (), **given)
+
+
+def _changed(
+    config: FinetuneConfig, *, labels: Sequence[str] | None = None,
+    factors: Sequence[str] | str | None = None, settings: Changes = (), **target: float | None,
+) -> FinetuneConfig:  # fmt: skip
+    """A configuration with settings, then options, changed."""
+    if isinstance(factors, str):
+        factors = [name.strip() for name in factors.split(",")]
     return with_changes(
-        config, texts_of(settings or ()), target__weight=weight, target__rendering_weight=rendering_weight,
-        target__labelled=labelled, target__labels=list(dict.fromkeys(labels or ())) or None,
+        config, texts_of(settings), target__labels=list(dict.fromkeys(labels or ())) or None,
         target__factors=None if factors is None else list(factors),
+        **{f"target__{key}": value for key, value in target.items()},
     )  # fmt: skip
 
 

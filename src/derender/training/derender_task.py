@@ -19,7 +19,7 @@ from derender.objectives.self_features import load_self_features, train_self_fea
 from derender.postprocess import Features
 from derender.postprocess.whitening import Whitening
 from derender.storage.atomic import DamageNoticed
-from derender.storage.folder import SplitRecord, write_config, write_split
+from derender.storage.folder import write_config
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
 from derender.training.config import TrainConfig
@@ -60,8 +60,7 @@ def train(
 def _add_features(
     config: TrainConfig, images: ImageSet, model: Derenderer, out: Path, report: Callable[[Progress], None]
 ) -> None:
-    """Estimate a trained model's features and held-out errors, and save both and its split with it."""
-    write_split(out, SplitRecord(config.split, config.seed))
+    """Estimate a trained model's features and held-out errors, and save both with it."""
     split = split_indices(images.files, config.split, seed=config.seed)
     mapped = isinstance(images.images, np.memmap)
     some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))

@@ -21,6 +21,7 @@ from torch import Generator, Tensor
 
 from derender.data import ImageSet, split_indices
 from derender.storage.atomic import DamageNoticed, atomic_file
+from derender.storage.folder import SplitRecord, write_split
 from derender.training import run_folder
 from derender.training.batches import Reader, batches_of, random_stream
 from derender.training.checkpoint import (
@@ -94,7 +95,7 @@ class _Run:
         task.check()
         self.folder = run_folder.RunFolder(out)
         if ranks.first and resume:
-            run_folder.reopen_run(out, config)
+            run_folder.reopen_run(out, config, run_folder.describe_data(images, split))
         elif ranks.first:
             device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
             run_folder.start_run(out, config, run_folder.describe_data(images, split), device)
@@ -335,8 +336,9 @@ class _Run:
                 self.save_model(best.images)
 
     def save_model(self, images: int) -> None:
-        """Save the model, whose weights have seen so many images."""
+        """Save the model, whose weights have seen so many images, with the run's split."""
         self.model.save(self.folder.model, overwrite=True)
+        write_split(self.folder.model, SplitRecord(self.config.split, self.config.seed))
         self.model_images = images
 
     def log(self, kind: str, values: dict[str, Any]) -> None:

@@ -4,11 +4,13 @@ import json
 import platform
 import subprocess
 from contextlib import suppress
+from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from reprlib import Repr
 from typing import Annotated, Any, NotRequired
 
+import numpy as np
 import torch
 from pydantic import ConfigDict, Field, FiniteFloat
 from typing_extensions import TypedDict
@@ -36,6 +38,8 @@ _MAY_CHANGE_ON_RESUME = (
     *("accumulate", "cuda_graph"),
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
+COMPARED = 16
+"""Of so many images the mean level is recorded (0 to 255), by which a resumed run knows its images."""
 _BEGUN = (LOCK_FILE, "environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
@@ -79,8 +83,8 @@ def refuse_taken(path: Path) -> None:
             )
 
 
-def reopen_run(path: Path, config: Settings) -> RunFolder:
-    """The folder of a run to resume; no run is a FileNotFoundError, settings that do not fit a ValueError."""
+def reopen_run(path: Path, config: Settings, data: dict[str, Any]) -> RunFolder:
+    """The folder of a run to resume; no run is a FileNotFoundError, other settings or data a ValueError."""
     run = RunFolder(path)
     if not run.config.is_file():
         raise FileNotFoundError(f"no run to resume in {path} (no config.yaml): train without --resume first")
@@ -98,6 +102,7 @@ def reopen_run(path: Path, config: Settings) -> RunFolder:
             f"{path} has seen {state.images:,} images and would train no further ({end}={asked[end]}), so "
             f"another {changed[0]} has no effect: raise {end}, or resume with the run's own settings"
         )
+    _require_same(path, data)
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)
     write_whole(run.config, f"format: {FORMAT}\n{to_yaml(config)}")
@@ -212,6 +217,29 @@ def environment(device: str) -> dict[str, Any]:
 
 
 def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
-    """The data of a run, for its environment.json."""
+    """The data of a run, for its environment.json: counts, and by what it is known again."""
     parts = {"pictures": images, **vars(split), "skipped": images.skipped, "duplicates": images.duplicates}
-    return {"layout": images.layout, **{name: len(values) for name, values in parts.items()}}
+    names = sha256("\0".join(images.files).encode("utf-8", "backslashreplace")).hexdigest()
+    some = images.images[:: max(1, len(images) // COMPARED)].mean(axis=(1, 2, 3)).round(2)
+    counts = {name: len(values) for name, values in parts.items()}
+    return {
+        "layout": images.layout,
+        **counts,
+        "names": names,
+        "levels": some.tolist(),
+    }
+
+
+def _require_same(path: Path, data: dict[str, Any]) -> None:
+    """A ValueError where a run recorded other images than ``data`` describe; old runs recorded less."""
+    file = path / "environment.json"
+    stored = parse_json(read_text(file), dict[str, Any]) if file.is_file() else {}
+    began = data | stored.get("data", {})
+    same = all(began[key] == data[key] for key in ("layout", "pictures", "names"))
+    if same and np.allclose(began["levels"], data["levels"], rtol=0, atol=1):  # decoders differ by less
+        return
+    one, other = (f"{each.get('pictures')} images ({each.get('layout')})" for each in (began, data))
+    raise ValueError(
+        f"{path} was trained on {one}, not on these {other}: resume with the same, or start a new run with "
+        "start_from"
+    )
