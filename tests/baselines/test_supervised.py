@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from derender.baselines import load_baseline, read_any_config, supervised
+from derender.baselines import load_baseline, read_any_config, supervised, train_baseline
 from derender.data import split_indices
 from derender.features import embed_image_set, model_fingerprint
+from derender.inputs import split_of
 from derender.training.config import with_changes
 from derender.training.run_folder import read_metrics
 
@@ -35,6 +36,7 @@ def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
     losses = [row["loss"] for row in read_metrics(tmp_path / "run") if row["kind"] == "train"]
     assert len(losses) == 18 and np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
     model = load_baseline(tmp_path / "run", "resnet18")
+    assert split_of(tmp_path / "run" / "model") == split_of(tmp_path / "run") is not None
     assert read_any_config(tmp_path / "run") == FEW and result.images == 144
     assert model.settings.classes == {"side": ("0", "1")}
     test = blobs.select(split_indices(blobs.files, FEW.split, seed=0).test)
@@ -47,6 +49,14 @@ def test_it_learns_from_few_labels_and_repeats(blobs, tmp_path):
     other.images[hidden] = 0
     supervised.Resnet18.train_into(FEW, other, tmp_path / "other")
     assert model_fingerprint(load_baseline(tmp_path / "other")) == model_fingerprint(model)
+
+
+def test_ctrl_c_tells_what_is_left(blobs, tmp_path):
+    def stop(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match=r"run has settings and losses but no model: train again"):
+        train_baseline(FEW, blobs, tmp_path / "run", progress=stop)
 
 
 def test_accuracy_counts_right_answers_among_known_labels(blobs):

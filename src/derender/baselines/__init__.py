@@ -59,7 +59,14 @@ def train_baseline(config: Any, images: Any, out: Any, **how: Any) -> Any:
     ``images`` are an image set at the configured size, ``out`` is a new folder; ``resume``, ``progress``,
     ``accelerator``, ``sample_sheet`` and the `TrainResult` are those of `derender.training.train`.
     """
-    return network_type(config.baseline).train_into(config, images, out, **how)
+    net = network_type(config.baseline)
+    try:
+        return net.train_into(config, images, out, **how)
+    except KeyboardInterrupt as stop:
+        if str(stop) or hasattr(net, "losses") or not Path(out).exists():  # of the loop, which resumes
+            raise
+        note = "has settings and losses but no model: train again into another folder"
+        raise KeyboardInterrupt(f"stopped by Ctrl-C; {out} {note}") from None
 
 
 def open_baseline(
