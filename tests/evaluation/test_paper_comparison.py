@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from derender.evaluation import compare
 from derender.evaluation.paper_tables import CARS, EMOTION, FACE_ATTRIBUTES, IDENTITY, LINEAR, SEGMENTATION
@@ -103,6 +104,17 @@ def test_clustering_tables_have_rows_of_finch_beside_ward():
     result = compare("emotion", {"few": few}, factors=None, resamples=20, cache="none")
     assert "few, FINCH" not in result.tables[0].values() and "few" in result.tables[0].values()
     assert any("FINCH left out: FINCH's finest partition" in note for note in result.notes)
+
+
+def test_a_question_with_too_few_images_of_each_class_is_left_out():
+    files, labels = tuple(map(str, range(24))), {name: np.arange(24) % 3 for name in ("identity", "emotion")}
+    few = FeatureTable(files, {"geometry": FEATURES["noise"][0][:24]}, labels)
+    how = {"factors": None, "resamples": 20, "cache": "none"}
+    result = compare("clustering", {"few": few}, **how)
+    assert list(result.values["parts"]) == ["emotion"]
+    assert any(note.startswith("identity left out: no class has 20 members") for note in result.notes)
+    with pytest.raises(ValueError, match="bring more images of each class"):
+        compare("identity", {"few": few}, **how)
 
 
 def test_linear_tables_and_the_papers():

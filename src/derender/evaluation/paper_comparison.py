@@ -108,7 +108,13 @@ def compare(
         if out.any():
             notes.append(f"{part.name}: {out.sum():,} rows left out that are none of the paper's classes")
         kept = [replace(row, tables=tuple(one.select(~out) for one in row.tables)) for row in rows]
-        ready = prepare(kept, columns, **part.rows(first))
+        try:
+            ready = prepare(kept, columns, **part.rows(first))
+        except ValueError as error:
+            if part.size is None or len(parts) == 1:
+                raise
+            notes.append(f"{part.name} left out: {error}")
+            continue
         layout = str(first.origin.get("layout", "unknown data"))
         beside = f"beside the paper's Table {spec.number}"
         more: dict[str, Any] = {"paper": part.paper}
