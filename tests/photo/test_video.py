@@ -58,7 +58,7 @@ def test_the_unchanged_scene_gives_the_film_back_with_its_sound(film, tmp_path):
     assert jumps[0] < 0.5 * raw
 
 
-def test_a_film_is_relit_where_its_face_is(film, tmp_path, capsys):
+def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd):
     words = ["relight", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "out"), "--hold"]
     assert main(words) == 0
     change = np.abs(read(tmp_path / "out" / "film" / "film.mp4").astype(int) - read(film))
@@ -69,10 +69,13 @@ def test_a_film_is_relit_where_its_face_is(film, tmp_path, capsys):
     named = [str(film), *(str(tmp_path / name) for name in ("none.mp4", "none.png"))]
     words = [*words[:3], *named, "-o", str(tmp_path / "two")]
     assert main(words) == 2  # the others are edited
-    assert capsys.readouterr().err.count("left out") == 2
+    assert capfd.readouterr().err.count("\n") == 2, "a line each, and none of OpenCV's"
     assert [folder.name for folder in (tmp_path / "two").iterdir()] == ["film"]
     assert main(["mesh", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "mesh")]) == 2
-    assert "is a video" in capsys.readouterr().err
+    assert "is a video" in capfd.readouterr().err
+    for option in ("--only-frame", "--size=64", "--detail=model"):
+        assert main([*words[:3], str(film), "-o", str(tmp_path / "whole"), option]) == 2
+        assert "is a video, which is drawn whole" in capfd.readouterr().err
     with pytest.raises(ValueError, match="cannot be read as a video"):
         edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict)
     with pytest.raises(ValueError, match="unknown frame of a video 'auto': choose face or none"):

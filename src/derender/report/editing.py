@@ -23,6 +23,7 @@ from derender.report.colours import enlarged
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
 from derender.storage.atomic import atomic_file, atomic_folder
+from derender.storage.places import counted
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, unlike
 
 FILM = "film.mp4"
@@ -80,7 +81,7 @@ class WrittenImages:
         result = Counter(part["found"] for part in self.framing.values())
         faces = result["face"] + result["profile"]
         if faces or result["no face"]:
-            lines.append(f"a face was found in {faces:,} of {result.total():,} images")
+            lines.append(f"a face was found in {faces:,} of {counted(result.total(), 'images')}")
         for what, then in NOTED.items():
             if count := result[what]:
                 first = next(path for path, part in self.framing.items() if part["found"] == what)
@@ -88,7 +89,7 @@ class WrittenImages:
         if result["auto"]:
             sides = [100 * part["side"] for part in self.framing.values() if part["side"] < 1]
             share = f", {_span(sides)} % of their side" if sides else ""
-            lines.append(f"shown in part{share}: {len(sides):,} of {result['auto']:,} images")
+            lines.append(f"shown in part{share}: {len(sides):,} of {counted(result['auto'], 'images')}")
         return lines
 
     def values(self) -> dict[str, Any]:
@@ -136,6 +137,11 @@ def write_images(
     moving = [file for file in files if is_video(file)]
     if moving and video is None:
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
+    unused = {"only_frame": opener.options.only_frame, "size": opener.options.size}
+    unused["detail=model"] = opener.detail == "model"
+    if moving and (given := [name for name, value in unused.items() if value]):
+        what = "is a video, which is drawn whole and in its own size"
+        raise ValueError(f"{moving[0]} {what}: leave out {', '.join(given)}")
     images_only = [file for file in files if file not in moving]
     read, refused = readable(images_only, opener.read, progress, needed=not moving and not done)
     shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
