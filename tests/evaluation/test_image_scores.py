@@ -40,7 +40,7 @@ def test_images_without_a_score_are_left_out():
 class Both(ImageResult):
     columns: ClassVar = {"side": Column("SIDE x 100", "low", scale=100), "mad": Column("MAD", "low", 1)}
     notes: ClassVar = {"plane": "flat"}
-    caption, coverage = "{} images", Column("coverage")
+    caption, coverage = "{}", Column("coverage")
 
     def named(self):
         side = np.array([0.01, 0.02, 0.03])

@@ -106,7 +106,7 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
     words = ["align", str(photos), "--out", str(tmp_path / "a"), "--largest"]
     assert main(words) == 2 and "exists already" in capsys.readouterr().err
     assert main([*words, "--force"]) == 0
-    assert "1 faces in 3 photographs; no face in 1, 1 boxes rejected" in capsys.readouterr().out
+    assert "1 face in 3 photographs; no face in 1, 1 rejected" in capsys.readouterr().out
     assert not (tmp_path / "a" / "two" / "pair-2.png").exists()
     (tmp_path / "mine.png").write_bytes(b"kept")
     text = (tmp_path / "a" / "boxes.csv").read_text().replace("two/pair.png,", "../mine.png,", 1)

@@ -7,6 +7,7 @@ from derender.baselines import BASELINES
 from derender.cli import options
 from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file, visible
 from derender.cli.options import command, option
+from derender.storage.places import counted
 
 NAMES = ", ".join(BASELINES)
 SIDE = "Side of the images in pixels, where no network fixes it (64); e4e enlarges them to its own."
@@ -67,6 +68,6 @@ def embed(
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())
     if name is None and (odd := derender.features.unlike_training(images.address, model, **images.how)):
         notice(odd)
-    output.result(f"{done.rows:,} rows in {out}: {sizes}")
+    output.result(f"{counted(done.rows, 'rows')} in {out}: {sizes}")
     names = ("rows", "factors", "labels", "origin", "skipped", "copies", "resumed")
     output.write({"out": out, **{name: getattr(done, name) for name in names}})

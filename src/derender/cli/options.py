@@ -20,6 +20,7 @@ from derender.report.options import ImageOptions, option
 from derender.storage.places import (
     DEVICES,
     bundled_models,
+    counted,
     hub_id,
     model_folder,
     require_image,
@@ -248,8 +249,7 @@ class ImageFiles:
             written = write_images(opener, self.images, self.out, edit, **how, progress=report)
         for note in written.notes():
             notice(note)
-        count = len(written.images)
-        output.result(f"{count:,} image{'s' if count != 1 else ''} in {self.out}")
+        output.result(f"{counted(len(written.images), 'images')} in {self.out}")
         output.write(written.values())
         if set(written.refused) & {str(path) for path in self.images}:  # of a folder others were used
             raise typer.Exit(2)

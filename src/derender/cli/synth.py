@@ -6,6 +6,7 @@ from typer import Typer
 
 from derender.cli.console import progress_bar, result, write_json
 from derender.cli.options import GeneratedOptions, command, option
+from derender.storage.places import counted
 
 
 def generate(
@@ -30,7 +31,7 @@ def generate(
         how = (size, request.seed, settings, request.truth, report, model)
         made = synthetic.write_generated(kind, request.out, count, *how)
     different = len(set(made.identity.tolist()))
-    result(f"{count:,} images of {different:,} {objects} in {request.out}", file)
+    result(f"{counted(count, 'images')} of {counted(different, objects)} in {request.out}", file)
     facts = {"count": count, objects: different, "image_size": size, "seed": request.seed}
     write_json(file, {"out": request.out, **facts, "settings": settings.model_dump(mode="json")})
 

@@ -51,7 +51,7 @@ class GeometryResult(ImageResult):
         "side": Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0", scale=100),
         "mad_deg": Column("MAD", "low", 1, "mean angle between normals in degrees, best 0"),
     }
-    caption = "Geometry on {:,} images with exact depth"
+    caption = "Geometry on {} with exact depth"
     coverage = Column(
         "coverage", None, note="share of the true object that the prediction covers; errors count only there"
     )

@@ -58,7 +58,7 @@ class FactorResult(ImageResult):
         "aligned": Column("aligned", "low", 1, "the same after the best rotation of all directions"),
         "camera": Column("camera", "low", 1, _CAMERA),
     }
-    caption = "Albedo, light and camera on {:,} images"
+    caption = "Albedo, light and camera on {}"
     notes: ClassVar[Mapping[str, str]] = {
         "constant answer": "mean albedo, mean light, a camera that never turns"
     }

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from derender.evaluation import bootstrap
 from derender.evaluation.score_table import Column, ScoreTable, scored_table
+from derender.storage.places import counted
 
 LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
 """Edges of Extended Yale B's subsets: the angle between light and view."""
@@ -53,7 +54,7 @@ class ImageResult:
         count = len(next(iter(self.each()["model"].values())))
         more = {} if self.coverage is None else {self.coverage: lambda row: self.named()[row.name].coverage}
         result = scored_table(
-            self.caption.format(count), "prediction", rows or self.rows(1), self.columns,
+            self.caption.format(counted(count, "images")), "prediction", rows or self.rows(1), self.columns,
             intervals=() if rows is None else tuple(self.columns), deviations=(), more=more, over="images",
         )  # fmt: skip
         return replace(result, rows=[replace(row, note=self.notes.get(row.name, "")) for row in result.rows])
@@ -111,7 +112,7 @@ def binned_rows(
         inside["beyond" if high == np.inf else f"<= {high:g}"] = (angle > low) & (angle <= high)
     inside = {name: rows for name, rows in inside.items() if rows.any()}
     counts = {name: int(rows.sum()) for name, rows in inside.items()}
-    columns = {name: Column(name, best, digits, f"{number:,} images") for name, number in counts.items()}
+    columns = {name: Column(name, best, digits, counted(number, "images")) for name, number in counts.items()}
     each = {
         row: {name: np.where(rows, own, np.nan) for name, rows in inside.items()}
         for row, own in scores.items()

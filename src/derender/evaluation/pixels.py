@@ -59,7 +59,7 @@ class ReconstructionResult(ImageResult):
         "psnr_db": Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"),
         "ssim": Column("SSIM", "high", note="structural similarity inside the mask, at most 1"),
     }
-    caption = "Reconstruction of {:,} images"
+    caption = "Reconstruction of {}"
     coverage = Column("coverage", None, note="share of all pixels inside the mask")
     notes: ClassVar[Mapping[str, str]] = {
         "untrained model": "same networks, fresh weights, inside its own mask"

@@ -24,6 +24,7 @@ from derender.photo.faces import PROFILE_DEG, UTKFACE, Face, Template, face_cand
 from derender.photo.frame import Frame
 from derender.storage.atomic import atomic_file
 from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, parse_json, read_text
+from derender.storage.places import counted
 from derender.training.held_out_errors import (
     OUTLIER_PERCENTILE,
     HeldOutErrors,
@@ -72,8 +73,9 @@ class Aligned:
         """One line."""
         n = self.counts
         return (
-            f"{n['faces']:,} faces in {n['photographs']:,} photographs; no face in {n['without_face']:,}, "
-            f"{n['rejected']:,} boxes rejected, {n['unreadable']:,} files unreadable ({BOXES} names each)"
+            f"{counted(n['faces'], 'faces')} in {counted(n['photographs'], 'photographs')}; no face in "
+            f"{n['without_face']:,}, {n['rejected']:,} rejected, {n['unreadable']:,} unreadable "
+            f"({BOXES} names each)"
         )
 
 

@@ -14,6 +14,7 @@ from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report.colours import enlarged, pictures
 from derender.report.page import Page
 from derender.report.panel import strip
+from derender.storage.places import counted
 
 
 def doctor_page(examination: Examination) -> Page:
@@ -52,5 +53,5 @@ def measure_table(examination: Examination) -> ScoreTable:
             cells = (one.value, 2 * one.error or None, check.struggles, check.objects)
             rows.append(Row(check.label, cells, note=check.note))
     compared = 0 if examination.shared is None else len(examination.shared.rows)
-    caption = f"{len(examination.images):,} images, {compared:,} distinct ones compared"
+    caption = f"{counted(len(examination.images), 'images')}, {compared:,} distinct ones compared"
     return ScoreTable(caption, "measure", [Column(name, None, 3, note) for name, note in notes.items()], rows)

@@ -111,6 +111,12 @@ def nearest_sibling(path: Path) -> str:
     return suggestion(path.name, [one.name for one in entries if one.is_dir() or one.name.endswith(known)])
 
 
+def counted(number: int, nouns: str) -> str:
+    """A number with its nouns, which end in s: "1 image", "1,200 images"."""
+    noun = nouns[:-3] + "y" if nouns.endswith("ies") else nouns.removesuffix("s")
+    return f"{number:,} {noun if number == 1 else nouns}"
+
+
 def require_known(what: str, word: str, known: Sequence[str]) -> None:
     """Raise ValueError where a word is not known, with the nearest that is."""
     if word not in known:
