@@ -195,6 +195,14 @@ def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, 
     assert (out / "1" / "strip.png").stat().st_mtime_ns == kept
 
 
+def test_results_among_the_images_are_no_images(tiny, tmp_path, numbers, refused):
+    words = ("decompose", "-m", tiny, noise(tmp_path / "in", 3), "-o")
+    for _ in range(2):
+        told, _ = numbers(*words, tmp_path / "in" / "out", "--force")
+        assert len(told["pictures"]) == 3
+    assert "is the folder of the images" in refused(*words, tmp_path / "in")
+
+
 def test_the_whole_photograph_is_written_unless_the_frame_is_asked_for(tiny, photos, tmp_path):
     wide = Image.new("RGB", (160, 96), (200, 30, 30))
     wide.paste(Image.open(photos / "0.png"), (48, 16))

@@ -37,6 +37,14 @@ def test_links_are_followed_once_and_what_cannot_be_read_is_listed(tree):
         assert "broken link" in source.skipped[0].reason
 
 
+def test_a_run_among_the_images_is_left_out(tree):
+    run = ["run/config.yaml", "run/environment.json", "run/samples/000000032.png"]
+    with open_source(folder := tree(["1.png", *run])) as source:
+        assert source.files == ("1.png",) and "a run folder" in source.skipped[0].reason
+    with open_source(folder / "run") as source:
+        assert source.images == ("samples/000000032.png",), "where it is named it is read"
+
+
 def test_names_that_are_not_utf8_can_be_stored(tree):
     folder = tree(["1.png"])
     (Path(os.fsdecode(os.fsencode(folder) + b"/\xff.png"))).write_bytes(b"content")

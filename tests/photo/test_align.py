@@ -98,6 +98,8 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
 
     with pytest.raises(KeyboardInterrupt, match="the same command continues"):
         derender.align(photos, tmp_path / "a", progress=stop)
+    with pytest.raises(ValueError, match="move it out"):
+        derender.align(photos, photos / "crops")
     with pytest.raises(ValueError, match="other options"):
         derender.align(photos, tmp_path / "a", size=64)
     finished = derender.align(photos, tmp_path / "a")

@@ -62,6 +62,6 @@ def swap(
     parameters = swappable(opener.model, factor or ())
     donor = opener.open(source)
     edit = partial(swapped_factors, opener.model, donor=donor, factors=list(parameters))
-    moving = any(is_video(path) for path in image_files(files.images))
+    moving = any(is_video(path) for path in image_files(files.images, files.out))
     video = swapped_video(list(parameters.values()), donor) if moving else None
     files.edit(opener, edit, output, beside=[donor], video=video)

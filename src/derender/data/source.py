@@ -27,6 +27,8 @@ from derender.storage.places import SUFFIXES
 
 FILE_LIMIT_BYTES = 512 << 20
 """No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
+RUN_FILES = {"config.yaml", "environment.json"}
+"""A folder inside that of the images with these files holds a run (``training.run_folder``)."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,9 @@ class FolderSource(FileSource):
                     entries = [entry for entry in listed if not is_hidden(entry.name)]
             except OSError as problem:
                 faults[here.rstrip("/") or "."] = f"folder cannot be listed: {problem.strerror}"
+                continue
+            if here and RUN_FILES.issubset(entry.name for entry in entries):
+                faults[here.rstrip("/")] = "a run folder: its sheets are no images to read"
                 continue
             for entry in entries:
                 name = f"{here}{entry.name}"

@@ -111,6 +111,8 @@ def align(
     if not (boxes.exists() or partial.exists()) and any(one.name[0] != "." for one in cutter.out.glob("*")):
         raise FileExistsError(f"{cutter.out} holds other files: choose an empty or new folder")
     stream = open_images(photos, dataset=dataset, limit=limit) if not isinstance(photos, Stream) else photos
+    if Path(stream.place).is_dir() and cutter.out.resolve().is_relative_to(Path(stream.place).resolve()):
+        raise ValueError(f"{out} is among the photographs, so crops would be read as such: move it out")
     with stream:
         plan = {"photos": stream.place, "size": size, "margin": margin, "largest": largest, "limit": limit}
         plan["model"] = None if model is None else str(getattr(model, "source", model))

@@ -128,7 +128,7 @@ def write_images(
         FileExistsError: something would be replaced, and ``force`` is off.
         ValueError: no image can be read, or the edit is impossible.
     """
-    files = image_files(paths)
+    files = image_files(paths, out)
     places, kept = _places(files, out), out / ROWS
     done = {file for file in files if resume and places[file].exists()}
     files = [file for file in files if file not in done]

@@ -148,15 +148,22 @@ class ImageOpener:
         return replace(image, render=detail)
 
 
-def image_files(paths: Sequence[Path]) -> list[Path]:
-    """The files that were named, and in place of a folder the images and videos in it, once each."""
+def image_files(paths: Sequence[Path], out: Path) -> list[Path]:
+    """The files that were named, and in place of a folder the images and videos in it, once each.
+
+    Files in ``out`` are results: of a folder around it they are left out; the folder itself is a ValueError.
+    """
     files: list[Path] = []
     for path in paths:
         if not path.is_dir():
             files.append(path)
             continue
+        if path.resolve() == out.resolve():
+            raise ValueError(f"{out} is the folder of the images: choose another --out, as {out / 'out'}")
         source = FolderSource(path)
         wanted = [source.on_disk(f) for f in source.files if is_image(f) or is_video(Path(f))]
+        if out.resolve().is_relative_to(path.resolve()):
+            wanted = [file for file in wanted if not file.resolve().is_relative_to(out.resolve())]
         if not wanted:
             raise ValueError(f"{path} holds no images")
         files += wanted
