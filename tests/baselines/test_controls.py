@@ -32,6 +32,8 @@ def test_pca_takes_its_components_from_other_pictures():
     flat = [p.images.reshape(len(p), -1).astype(np.float32) / 255 for p in (train, test)]
     expected = PCA(4, whiten=True, random_state=0).fit(flat[0]).transform(flat[1])
     np.testing.assert_allclose(codes, expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="PCA needs 2 images or more"):
+        controls.pca_features(train.select(slice(1)), components=1)
     with pytest.raises(ValueError, match=r"64 components cannot be had from 30 images: ask for 1 to 30"):
         controls.pca_features(train)
     with pytest.raises(ValueError, match=r"fitted on images \(3, 4, 4\) does not take \(3, 8, 8\)"):

@@ -165,7 +165,7 @@ def test_bad_pictures_are_left_out_and_named(tiny, photos, tmp_path, capsys):
     assert [folder.name for folder in (tmp_path / "out").iterdir()] == ["0"]
 
 
-def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, monkeypatch):
+def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, monkeypatch, capsys):
     folder, out = Path(shutil.copytree(photos, tmp_path / "folder")), tmp_path / "out"
     (folder / "bad.jpg").write_bytes(b"no picture")
     words = ("rotate", "-m", tiny, folder, "-o", out, "--size", 32, "--stills", 2, "--film", "none")
@@ -183,6 +183,7 @@ def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, 
     with monkeypatch.context() as stop:
         stop.setattr(Edit, "write", interrupted)
         assert run(*words) == 130
+    assert "what is done is kept: --resume continues" in capsys.readouterr().err
     assert not (out / "sheet.png").exists() and len(list(out.glob("[0-9]"))) == 3
     numbers(*words, "--resume")
     assert (out / "sheet.png").read_bytes() == sheet and not (out / ".sheet").exists()  # with every picture

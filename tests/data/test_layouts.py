@@ -281,6 +281,8 @@ FAULTS = [
     ({**EPISODES, "ids/buffy.ids": BUFFY + "13 dawn\n"}, {}, "line 5: track 13 has two names"),
     ({"x.ids": BUFFY, "77/1.jpg": None}, {}, r"expected NAME\.ids with some image in NAME/N"),
     ({"data.csv": "name,x\n1.png,2\n", "1.png": None}, AS, r"no column of paths \(file, path, .*columns"),
+    ({"data.csv": "file;x\n1.png;2\n", "1.png": None}, {}, r"its columns are file;x"),
+    ({"data.csv": "File,x\n7.png,1\n", "1.png": None}, {}, r"'File' of data\.csv .* no image"),
     ({"data.csv": "file\n../1.png\n", "1.png": None}, AS, r"row 1: .* relative to the table .* got"),
     ({"data.csv": "file\nC:\\1.png\n", "1.png": None}, AS, "row 1: expected a path relative"),
     ({"data.csv": "file\n1.png\n./1.png\n", "1.png": None}, AS, r"row 2: '1\.png' is there twice"),

@@ -76,7 +76,7 @@ def pca_features(
 
     ``fit_on`` gives the components; by default ``images`` themselves. ``seed`` is of the randomised solver.
     """
-    source = images if fit_on is None else fit_on
+    source = (images if fit_on is None else fit_on).require(2, "PCA")
     shape = source.images.shape[1:]
     limit = min(len(source), int(np.prod(shape)))
     if not 1 <= components <= limit:

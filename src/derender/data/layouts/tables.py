@@ -71,7 +71,8 @@ def is_listed(source: Source) -> bool:
     if isinstance(source, TableSource) or file is None or not source.images:
         return isinstance(source, TableSource)
     try:
-        return bool({*PATH_COLUMNS} & {*_cells(source, file)})
+        names = ";".join(_cells(source, file)).lower()  # which other signs than commas may part
+        return not {*PATH_COLUMNS}.isdisjoint(re.split("[;\t]", names))
     except ValueError:
         return stem_of(file) == "data"
 
