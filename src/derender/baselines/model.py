@@ -21,15 +21,9 @@ from torch import Generator, Tensor, nn
 from derender.baselines import network_type
 from derender.data import ImageSet, check_images, split_indices
 from derender.settings import Settings
+from derender.storage import folder as saved
 from derender.storage.atomic import new_folder
-from derender.storage.folder import (
-    FORMAT,
-    SplitRecord,
-    naming_damage,
-    read_weights,
-    saved_config,
-    write_split,
-)
+from derender.storage.folder import FORMAT, naming_damage, read_weights, saved_config
 from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE, require_known
 from derender.storage.tensors import write_tensors
 from derender.training import config as configs
@@ -291,7 +285,7 @@ class ShortRun:
         """Save the model; ``numbers`` are the last scores by name."""
         seconds = self.seconds
         model.save(self.folder.model)
-        write_split(self.folder.model, SplitRecord(self.config.split, self.config.seed))
+        saved.write_split(self.folder.model, saved.SplitRecord(self.config.split, self.config.seed))
         return loop.TrainResult(self.folder.path, images, seconds, images / seconds, numbers, "images", ())
 
 

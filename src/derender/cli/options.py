@@ -249,8 +249,9 @@ class ImageFiles:
             try:
                 written = write_images(opener, self.images, self.out, edit, **how, progress=report)
             except KeyboardInterrupt:
-                kept = "what is done is kept" if self.out.exists() else "nothing was done yet"
-                raise KeyboardInterrupt(f"stopped by Ctrl-C; {kept}: --resume continues") from None
+                raise KeyboardInterrupt(
+                    "stopped by Ctrl-C; what is done is kept: --resume continues"
+                ) from None
         for note in written.notes():
             notice(note)
         output.result(f"{counted(len(written.images), 'images')} in {self.out}")

@@ -27,8 +27,6 @@ from derender.storage.places import SUFFIXES
 
 FILE_LIMIT_BYTES = 512 << 20
 """No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
-RUN_FILES = {"config.yaml", "environment.json"}
-"""A folder inside that of the images with these files holds a run (``training.run_folder``)."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,7 @@ class FolderSource(FileSource):
             except OSError as problem:
                 faults[here.rstrip("/") or "."] = f"folder cannot be listed: {problem.strerror}"
                 continue
-            if here and RUN_FILES.issubset(entry.name for entry in entries):
+            if here and {"config.yaml", "environment.json"}.issubset(entry.name for entry in entries):
                 faults[here.rstrip("/")] = "a run folder: its sheets are no images to read"
                 continue
             for entry in entries:

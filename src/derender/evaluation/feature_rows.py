@@ -220,8 +220,7 @@ def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndar
     if not rows:
         largest = max(map(len, places.values()), default=0)
         raise ValueError(
-            f"no class has {count} members or more (the largest has {largest}): bring more images of each "
-            "class, or keep smaller classes"
+            f"no class has {count} members or more (the largest has {largest}): bring more of each"
         )
     return np.sort(np.array(rows))
 

@@ -139,7 +139,7 @@ def write_images(
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
     unused = {"only_frame": opener.options.only_frame, "size": opener.options.size}
     unused["detail=model"] = opener.detail == "model"
-    if moving and (given := [name for name, value in unused.items() if value]):
+    if moving and moving == files and (given := [name for name, value in unused.items() if value]):
         what = "is a video, which is drawn whole and in its own size"
         raise ValueError(f"{moving[0]} {what}: leave out {', '.join(given)}")
     images_only = [file for file in files if file not in moving]

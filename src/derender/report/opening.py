@@ -149,10 +149,7 @@ class ImageOpener:
 
 
 def image_files(paths: Sequence[Path], out: Path) -> list[Path]:
-    """The files that were named, and in place of a folder the images and videos in it, once each.
-
-    Files in ``out`` are results: of a folder around it they are left out; the folder itself is a ValueError.
-    """
+    """The files that were named, once each, and of folders the images and videos that are not in ``out``."""
     files: list[Path] = []
     for path in paths:
         if not path.is_dir():

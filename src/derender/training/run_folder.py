@@ -38,8 +38,6 @@ _MAY_CHANGE_ON_RESUME = (
     *("accumulate", "cuda_graph"),
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
-COMPARED = 16
-"""Of so many images the mean level is recorded (0 to 255), by which a resumed run knows its images."""
 _BEGUN = (LOCK_FILE, "environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
 _REPORTED_PACKAGES = ("derender", "torch", "numpy", "numba", "lightning-fabric", "safetensors", "pillow")
 
@@ -220,7 +218,7 @@ def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
     """The data of a run, for its environment.json: counts, and by what it is known again."""
     parts = {"pictures": images, **vars(split), "skipped": images.skipped, "duplicates": images.duplicates}
     names = sha256("\0".join(images.files).encode("utf-8", "backslashreplace")).hexdigest()
-    some = images.images[:: max(1, len(images) // COMPARED)].mean(axis=(1, 2, 3)).round(2)
+    some = images.images[:: max(1, len(images) // 16)].mean(axis=(1, 2, 3)).round(2)
     counts = {name: len(values) for name, values in parts.items()}
     return {
         "layout": images.layout,
@@ -240,6 +238,5 @@ def _require_same(path: Path, data: dict[str, Any]) -> None:
         return
     one, other = (f"{each.get('pictures')} images ({each.get('layout')})" for each in (began, data))
     raise ValueError(
-        f"{path} was trained on {one}, not on these {other}: resume with the same, or start a new run with "
-        "start_from"
+        f"{path} was trained on {one}, not on these {other}: resume with those or set start_from"
     )
