@@ -158,8 +158,7 @@ def _opened(video: Path) -> Any:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # a damaged file is named once, by us
     import cv2
 
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     reader = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     cv2.utils.logging.setLogLevel(level)
     if not reader.isOpened() or reader.get(cv2.CAP_PROP_FPS) <= 0:

@@ -140,8 +140,7 @@ def write_images(
     unused = {"only_frame": opener.options.only_frame, "size": opener.options.size}
     unused["detail=model"] = opener.detail == "model"
     if moving and moving == files and (given := [name for name, value in unused.items() if value]):
-        what = "is a video, which is drawn whole and in its own size"
-        raise ValueError(f"{moving[0]} {what}: leave out {', '.join(given)}")
+        raise ValueError(f"{moving[0]} is a video, which is drawn whole: leave out {', '.join(given)}")
     images_only = [file for file in files if file not in moving]
     read, refused = readable(images_only, opener.read, progress, needed=not moving and not done)
     shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
