@@ -130,12 +130,12 @@ def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[
 
 
 def with_steps(read: Callable[[Any], Iterator[list[str]]], file: str) -> Callable[[Any], Iterator[list[str]]]:
-    """The rows of a table, above them its first row with 60 steps per image, from a file of its own."""
+    """The rows of a table, above them its first row with 20 steps per image, from a file of its own."""
 
     def both(result: Any) -> Iterator[list[str]]:
         head, *rows = read(result)
         _, first, *_ = read(kept(file))
-        yield from (head, [f"{first[0]}, 60 steps per image", *first[1:]], *rows)
+        yield from (head, [f"{first[0]}, 20 steps per image", *first[1:]], *rows)
 
     return both
 
@@ -343,6 +343,7 @@ FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files,
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "gpu-agreement": ("gpu.json", speed.gpu_agreement),
     "fitting": ("fitting.json", speed.fitting),
+    "disentangling": ("fitting.json", speed.disentangling),
     "heads-generated": (f"generated/heads.json {FITTED}", with_steps(scored(DEPTH, *GEOMETRY), FITTED)),
     "faces-128": ("sharpness.json", sharp),
     "heads-128": ("generated/heads-128.json", scored(DEPTH, *GEOMETRY)),

@@ -99,12 +99,18 @@ def profiled(result: Any) -> Iterator[list[str]]:
 
 
 def fitting(result: Any) -> Iterator[list[str]]:
-    yield [f"{result['images']} scenes of 64 pixels, one thread", "CPU ms an image"]
-    before = 1000 * result["fit"]["portions_of_4_s"] / result["images"]
-    if "feed_forward_ms_per_image" in result["fit"]:
-        yield ["feed-forward", f"{result['fit']['feed_forward_ms_per_image']:.1f}"]
-    yield [f"optimised for {result['steps']} steps, portions of 64", f"{result['fit']['ms_per_image']:.1f}"]
-    yield [f"optimised for {result['steps']} steps, portions of four", f"{before:.1f}"]
+    size = f"{result['images']} scenes of 64 pixels, one thread"
+    yield [size, "steps", "CPU ms an image", "SIDE x 100", "normals", "error of images"]
+    yield ["feed-forward", "0", f"{result['feed_forward_ms_per_image']:.1f}", "", "", ""]
+    for name, row in result["rows"].items():
+        scores = f"{row['side']:.3f}", f"{row['mad_deg']:.1f}°", f"{row['error']:.4f}"
+        yield [name, str(row["steps"]), f"{row['ms_per_image']:.1f}", *scores]
+
+
+def disentangling(result: Any) -> Iterator[list[str]]:
+    yield [f"`evaluate disentangle`, {result['disentangle_images']} images, one thread", "CPU s", "swap test"]
+    for name, row in result["rows"].items():
+        yield [name, f"{row['disentangle_s']:.1f}", f"{row['swap_ratio']:.2f}"]
 
 
 def gpu_steps(result: Any) -> Iterator[list[str]]:

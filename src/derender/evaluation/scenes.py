@@ -70,7 +70,7 @@ def geometry(
     if {"albedo", "light", "camera"} <= set(known):
         protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **how)
     protocols["reconstruction"] = ReconstructionResult, again
-    inputs = {**known, "seed": seed, "fitted": fit_steps or 0}
+    inputs = {**known, "seed": seed, "steps": fit_steps or 0}
     result = _scored(model, protocols, inputs, resample_count, memory)
     if isinstance(factors := result.values.get("factors"), FactorResult):
         parts = {"factors": replace(factors, untrained=None), "factors_untrained": factors.untrained}
@@ -111,7 +111,7 @@ def reconstruction(
             batch_size=batch_size, progress=progress,
         )  # fmt: skip
 
-    inputs = {"images": images.images, "fitted": known, "seed": seed, "fit_steps": fit_steps or 0}
+    inputs = {"images": images.images, "fitted": known, "seed": seed, "steps": fit_steps or 0}
     result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, resample_count, memory)
     intervals = result.values["intervals"]["reconstruction"]
     return replace(result, values={**result.values, "intervals": intervals})
