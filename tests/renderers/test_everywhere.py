@@ -42,7 +42,8 @@ def test_features_and_fitted_scenes_hold_further_factors(model, generator):
         assert (moved > 1e-3).all()
     model.renderer.check(result.scene)
     alone = model.fit_scenes(images[1:2], 12).scene
-    assert torch.equal(alone.depth[0], result.scene.depth[1])
+    together = result.scene[1].parameters
+    assert all(torch.equal(value, together[name]) for name, value in alone.parameters.items())
 
 
 def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generator, tmp_path):

@@ -34,7 +34,7 @@ def irradiance(
 ) -> Float[Tensor, "n c h w"]:
     """The light on surfaces, from 0 on; one channel or three."""
     coefficients = environment.view(len(environment), -1, 9)
-    return torch.einsum("nhwk,nck->nchw", harmonics(normal), coefficients).relu()
+    return (harmonics(normal)[:, None] * coefficients[:, :, None, None]).sum(dim=-1).relu()
 
 
 def from_light(light: Float[Tensor, "n 4"], channels: int = 1) -> Float[Tensor, "n k"]:
