@@ -51,7 +51,8 @@ def scored(model: derender.Derenderer, fitted: fitting.Fitted, truth: SyntheticS
     """SIDE times 100, normals in degrees, and the error of the images of fitted scenes."""
     with torch.no_grad():
         rendering = model.render(fitted.scene)
-    depth, mask, normal = map(torch.from_numpy, (truth.depth, truth.mask, truth.normal))
+    maps = (getattr(truth, name)[: len(fitted.after)] for name in ("depth", "mask", "normal"))
+    depth, mask, normal = map(torch.from_numpy, maps)
     scores = geometry_scores(rendering.depth, rendering.mask > 0.5, depth, mask, truth.fov_deg, normal)
     return {"side": 100 * scores.side, "mad_deg": scores.mad_deg, "error": float(fitted.after.mean())}
 
