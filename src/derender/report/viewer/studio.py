@@ -193,7 +193,7 @@ class Studio:
             scene = scene.with_parameters(camera=question.camera.camera_row())
         for factor, values in question.numbers.items():
             if factor not in (own := self._numbers(scene)):
-                raise Refused(422, f"numbers: this model has no {factor!r}; it has: {list(own)}")
+                raise Refused(422, f"numbers: this model has no {factor!r}; it has {', '.join(own)}")
             scene = scene.with_parameters(**{parameters[factor]: torch.tensor([values])})
         try:
             self.model.renderer.check(scene)
