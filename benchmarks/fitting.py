@@ -40,7 +40,7 @@ def model_for(stack: ExitStack, plain: bool, portion: int) -> tuple[derender.Der
         for name, value in PLAIN.items():
             stack.enter_context(patch.object(fitting, name, value))
         axes = patch.object(
-            fitting.Fitting, "_measured", lambda self, render, rates, sizes: torch.eye(len(rates))
+            fitting.Fitting, "_measured_directions", lambda self, render, rates, sizes: torch.eye(len(rates))
         )
         stack.enter_context(axes)
     steps, model = PLAIN_STEPS if plain else fitting.STEPS, derender.load(MODEL)

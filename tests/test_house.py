@@ -36,7 +36,7 @@ BUDGET = {  # lines, files
     "learn": (945, 5),
 }
 TOTAL = (39_690, 248)  # on the way to (37_000, 270)
-TEST_LINES = 25_875
+TEST_LINES = 25_880
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -173,7 +173,9 @@ def test_a_file_of_something_else_is_refused(tmp_path, tensors, told):
 def test_measured_directions_lead_further_than_the_coordinates_themselves(monkeypatch):
     images = torch.from_numpy(np.ascontiguousarray(faces.generate(8, 64, seed=5).images)).float() / 255
     along = derender.load("rendered-faces-64").fit_scenes(images, 12)
-    monkeypatch.setattr(Fitting, "_measured", lambda self, render, rates, sizes: torch.eye(len(rates)))
+    monkeypatch.setattr(
+        Fitting, "_measured_directions", lambda self, render, rates, sizes: torch.eye(len(rates))
+    )
     monkeypatch.setattr("derender.postprocess.fitting._STEP", 1.0)
     plain = derender.load("rendered-faces-64").fit_scenes(images, 12)
     assert torch.equal(along.before, plain.before)

@@ -25,7 +25,7 @@ PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
 """Factors that are fitted within the morphable model, and what they fill."""
 
 STEPS = 20
-"""Twice as many bring the error down by 1 % more."""
+"""Twice as many bring the error down by half a percent more."""
 
 _START_LIMIT = 2.5  # standard deviations; predictions beyond are unreliable
 _COORDINATES = (0.1, -math.inf, math.inf)  # how far a step goes, least and most: standard deviations
@@ -98,7 +98,8 @@ class Fitting(nn.Module):
         super().__init__()
         self.maps, self.settings = maps, settings
         self.register_buffer("length", torch.tensor(float(length)), persistent=False)
-        numbers = [settings.steps, settings.prior, settings.tolerance, *[_STEP] * bool(settings.steps)]
+        numbers = [settings.steps, settings.prior, settings.tolerance]
+        numbers += [_STEP] if settings.steps else []  # features of plain Adam are others
         numbers = torch.tensor(numbers, dtype=torch.float64)
         self.register_buffer("told", numbers, persistent=False)  # the name is part of a model's fingerprint
         self._directions: Tensor | None = None
@@ -163,7 +164,7 @@ class Fitting(nn.Module):
                 same = one.map(lambda value: value.expand(len(moved), *value.shape[1:]))
                 return rendered(moved, same.extra)[1]
 
-            self._directions = directions = self._measured(alone, rates, sizes)
+            self._directions = directions = self._measured_directions(alone, rates, sizes)
         moved = torch.cat(start, dim=1) / rates
         mean, square = torch.zeros_like(moved), torch.zeros_like(moved)
         before = torch.empty(0)
@@ -176,6 +177,7 @@ class Fitting(nn.Module):
             loss = (error / _NOISE + self.settings.prior * usual).sum()
             (gradient,) = torch.autograd.grad(loss, moved)
             with torch.no_grad():
+                # what is at its bound and pulled outwards stays, and moves nothing with it
                 held = ((moved <= low / rates) & (gradient > 0)) | ((moved >= high / rates) & (gradient < 0))
                 gradient, along = gradient.masked_fill(held, 0.0), torch.zeros_like(moved)
                 torch.ops.aten._fused_adam_(  # torch.optim first imports the compiler, for a second
@@ -191,7 +193,7 @@ class Fitting(nn.Module):
         return Fitted(fitted.detach(), dict(zip(PARAMETERS, result, strict=True)), before, after)
 
     @torch.no_grad()
-    def _measured(
+    def _measured_directions(
         self, render: Callable[[Tensor], Rendering], rates: Float[Tensor, " p"], sizes: Sequence[int]
     ) -> Float[Tensor, "p p"]:
         """Directions, as columns, in which a step of 1 changes the loss of typical scenes alike.
