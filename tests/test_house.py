@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_690, 15),
     "features": (1_385, 8),
     "interpretation": (1_085, 5),
-    "photo": (1_510, 7),  # new light falls on the object alone
+    "photo": (1_520, 7),  # the surface that is shaded is smoothed
     "networks": (710, 5),
     "storage": (955, 8),  # only saved folders are replaced
     "objectives": (640, 5),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_690, 248)  # on the way to (37_000, 270)
+TOTAL = (39_700, 248)  # on the way to (37_000, 270)
 TEST_LINES = 25_880
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

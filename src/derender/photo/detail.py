@@ -44,6 +44,7 @@ COLOUR_MARGIN = 0.25  # of the canonical map, left out of what colours are carri
 RIM_SHARE = 0.04  # of the side: the rim of the model's maps, where depth ends in a wall
 REACH_SHARE = 1 / 4  # of the side: how far the surface goes on around them, at least
 FADE_SHARE = 1 / 3  # reach of new shading around them
+SMOOTH_SHARE = 0.012  # of the side: reach of the box filters over the depth that is shaded
 SURE = 0.65  # of half the side: radius within which what faces the camera is the object
 LIKELY = (0.80, 0.60)  # of half the side: radius, and column, in which the search for its outline starts
 DARKEST = 1e-3
@@ -145,6 +146,9 @@ class PhotoDetail:
         return _ramp(-torch.maximum(along, along[:, None]), -none, -full)[None, None].to(self.photo)
 
     def _light(self, scene: Scene) -> Float[Tensor, "n 1 h w"]:
+        """Shading of the smoothed surface: what is finer in a model's depth is often not there."""
+        depth, reach = scene.depth[:, None], round(SMOOTH_SHARE * self.grid)
+        scene = scene.with_parameters(depth=_averaged(depth, reach)[:, 0])
         return self.renderer.shading(scene, self.wide_fov).mean(dim=1, keepdim=True)
 
     def albedo(self) -> Float[Tensor, "1 3 s s"]:
@@ -312,12 +316,16 @@ def _ramp(value: Tensor, low: float, high: float) -> Tensor:
 
 def _blurred(maps: Tensor, reach: float) -> Tensor:
     """Three box filters of so many pixels to either side, on a quarter of the resolution."""
-    reach = max(1, round(reach / 4))
     small = interpolate(maps, scale_factor=0.25, mode="area")
+    return interpolate(_averaged(small, max(1, round(reach / 4))), maps.shape[-2:], mode="bilinear")
+
+
+def _averaged(maps: Tensor, reach: int) -> Tensor:
+    """Three box filters of so many pixels to either side."""
     for _ in range(3):
-        small = avg_pool2d(pad(small, (reach,) * 4, mode="replicate"), (2 * reach + 1, 1), stride=1)
-        small = avg_pool2d(small, (1, 2 * reach + 1), stride=1)
-    return interpolate(small, maps.shape[-2:], mode="bilinear")
+        maps = avg_pool2d(pad(maps, (reach,) * 4, mode="replicate"), (2 * reach + 1, 1), stride=1)
+        maps = avg_pool2d(maps, (1, 2 * reach + 1), stride=1)
+    return maps
 
 
 def _eroded(maps: Tensor, reach: int) -> Tensor:
