@@ -4,7 +4,7 @@ A table of mixtures is written, 50,000 rows in memory at a time. FAISS gets an i
 factor by cosine, read a row group at a time; its neighbours are compared with exact search. DuckDB reads the
 parquet file where it lies.
 
-    pip install faiss-cpu duckdb
+    pip install '.[scale]'
     python benchmarks/table_million.py --json benchmarks/results/table_million.json
 """
 

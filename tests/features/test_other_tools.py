@@ -16,8 +16,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "scale.md"
 def table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     geometry = np.random.default_rng(3).normal(size=(40, 8)).astype(np.float32)
-    files, kinds = tuple(f"{row:02d}.png" for row in range(40)), np.array(["jeep"] * 30 + ["sports"] * 10)
-    made = FeatureTable(files=files, factors={"geometry": geometry}, labels={"kind": kinds})
+    made = FeatureTable(tuple(f"{row:02d}.png" for row in range(40)), {"geometry": geometry}, {})
     made.write("features.parquet")
     return made
 
@@ -26,12 +25,16 @@ def run(tool: str, call: str, storage: str = "Flat") -> dict[str, Any]:
     pytest.importorskip(tool, reason=f"needs pip install {tool}")
     (block,) = [one for one in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if call in one]
     names: dict[str, Any] = {}
-    exec(block.replace("duckdb.sql", "found = duckdb.sql").replace("128,Flat", f"128,{storage}"), names)
+    exec(block.replace("128,Flat", f"128,{storage}"), names)
     return names
 
 
-def test_duckdb_counts_the_rows_of_each_kind(table):
-    assert sorted(run("duckdb", "duckdb.sql")["found"].fetchall()) == [("jeep", 30), ("sports", 10)]
+def test_duckdb_finds_the_rows_that_search_finds(table):
+    (own, itself), *nearest = run("duckdb", "duckdb.sql")["nearest"]
+    result = search(table, table.files[0], factor="geometry", k=9)
+    assert own == table.files[0] and itself == pytest.approx(1)
+    assert [file for file, _ in nearest] == [table.files[row] for row in result.rows]
+    np.testing.assert_allclose([1 - one for _, one in nearest], result.distances, atol=1e-6)
 
 
 def test_faiss_finds_the_rows_that_search_finds(table):
