@@ -3,9 +3,7 @@
     python docs/pages.py                 # rewrite every table that a page names
     python docs/pages.py tutorials       # run the tutorials and rewrite the output that they show
 
-A page names a table as ``<!-- table: people-lfw accuracy nmi -->``: the columns of
-benchmarks/results/tables/people-lfw.json that follow, all where none does (``result_tables``). The table ends
-with ``<!-- end -->``.
+A page names a table of ``result_tables.FILES`` as ``<!-- table: people -->``; it ends with ``<!-- end -->``.
 """
 
 import contextlib
@@ -21,7 +19,7 @@ from typing import Any
 from result_tables import table
 
 ROOT = Path(__file__).resolve().parents[1]
-TABLE = re.compile(r"<!-- table: (\S+)((?: \S+)*) -->\n(.*?)<!-- end -->", re.DOTALL)
+TABLE = re.compile(r"<!-- table: (\S+) -->\n(.*?)<!-- end -->", re.DOTALL)
 TUTORIALS = ("quickstart", "own-folder", "scikit-learn")
 STEP = re.compile(r"```(python|sh)\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
 
@@ -33,9 +31,7 @@ def pages() -> list[Path]:
 
 def with_tables(page: str) -> str:
     """A page with each of its tables as its file has it."""
-    return TABLE.sub(
-        lambda m: f"<!-- table: {m[1]}{m[2]} -->\n{table(m[1], m[2].split())}\n<!-- end -->", page
-    )
+    return TABLE.sub(lambda m: f"<!-- table: {m[1]} -->\n{table(m[1])}\n<!-- end -->", page)
 
 
 def run_tutorial(text: str) -> tuple[str, dict[str, bytes]]:

@@ -1,157 +1,145 @@
 """Tables of results as Markdown, from the files that commands and benchmarks wrote.
 
-A table is one of ``FILES``, each read by a function of its own, or a file of benchmarks/results/tables with
-its columns in it. There a row with ``hidden`` stays in the file.
+A table is one of ``FILES``: the files it shows, under benchmarks/results, the first for its reader.
 """
 
-import json
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import fmean
 from typing import Any
 
 import paper_rows as theirs
 import renderer_tables as drawn
 import speed_tables as speed
-from paper_rows import RESULTS, kept
+from paper_rows import kept
 from renderer_tables import spread
+from side_by_side import CARS, HEADS_FILE, LFW, SIDE_BY_SIDE, Reader
 
 
-def table(name: str, keys: list[str] | None = None) -> str:
-    """One table as Markdown, with a note: its file, and data that are not generated."""
-    if name in FILES:
-        files, read = FILES[name]
-        first, *_ = names = files.split()
-        head, *rows = read(json.loads((RESULTS / first).read_text()))
-        lines = [head, ["---"] * len(head), *rows]
-        note = ", ".join(f"`benchmarks/results/{one}`" for one in names)
-    else:
-        result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
-        lines = [*body(result, keys or [column["key"] for column in result["columns"]])]
-        note = f"`benchmarks/results/tables/{name}.json`"
-        kept = {False: "from its owners", True: "not published"}
-        sets = [
-            f"{re.split(r' at |: |, ', x)[0]} ({kept['not published' in x]})" for x in result.get("needs", ())
-        ]
-        note += "; data: " + ", ".join(sets) if sets else ""
-    shown = "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+def table(name: str) -> str:
+    """One table as Markdown, with a note that names its files."""
+    files, _ = FILES[name]
+    head, *rows = body(name)
+    lines = ["| " + " | ".join(line) + " |" for line in (head, *rows)]
+    note = ", ".join(f"`benchmarks/results/{file}`" for file in files.split())
+    note += ", transcribed from output that was not kept" if files.startswith("tables/") else ""
+    shown = "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
     return f"{shown}\n\n{textwrap.fill(f'Source: {note}.', 118, break_on_hyphens=False)}\n"
 
 
-def body(result: Mapping[str, Any], keys: list[str]) -> Iterator[list[str]]:
-    """Rows of cells: the head, the rule, the rows; the best of each column is bold."""
-    columns = {column["key"]: column for column in result["columns"]}
-    rows = [row for row in result["rows"] if not row.get("hidden") and any(key in row for key in keys)]
-    yield ["", *(columns[key]["head"] for key in keys)]
-    yield ["---"] * (len(keys) + 1)
-    best = {key: best_of(columns[key], [row[key] for row in rows if key in row]) for key in keys}
-    for row in rows:
-        cells = [cell(row.get(key), columns[key].get("digits", 0), best[key]) for key in keys]
-        note = " (control)" if row.get("control") and "(control" not in row["name"] else ""
-        yield [row["name"] + note, *cells]
+def body(name: str) -> list[list[str]]:
+    """The rows of a table, the head first."""
+    files, read = FILES[name]
+    return list(read(kept(files.split()[0])))
 
 
 def looked_up(reference: re.Match[str]) -> str:
-    """``{table|row|column}`` in a cell: that number, as its own table shows it, without its interval."""
-    name, row, key = reference[1].split("|")
-    if name in FILES:
-        head, *rows = FILES[name][1](kept(FILES[name][0].split()[0]))
-        return next(cells for cells in rows if cells[0] == row)[head.index(key)].split(" (")[0]
-    result = json.loads((RESULTS / "tables" / f"{name}.json").read_text())
-    digits = next(column["digits"] for column in result["columns"] if column["key"] == key)
-    return cell(value_of(next(one for one in result["rows"] if one["name"] == row)[key]), digits, None)
+    """``{table|row|column}``: that number, as its own table shows it, without its interval."""
+    name, row, column = reference[1].split("|")
+    head, *rows = body(name)
+    return next(cells for cells in rows if cells[0] == row)[head.index(column)].split(" ")[0]
 
 
-def value_of(entry: Any) -> float:
-    return entry["value"] if isinstance(entry, dict) else entry
+def summary(_: Any) -> Iterator[list[str]]:
+    """Each result beside its strongest control, every number looked up in the table of its own."""
+    yield ["", "derender", "strongest control", "lost to it"]
+    for row in SUMMARY:
+        yield [re.sub(r"\{(.+?)\}", looked_up, cell) for cell in row]
 
 
-def best_of(column: Mapping[str, Any], entries: list[Any]) -> float | None:
-    if "best" not in column or not entries:
-        return None
-    return (max if column["best"] == "high" else min)(map(value_of, entries))
+SUMMARY = (
+    (
+        "depth of generated heads, SIDE x 100 (low)",
+        "{heads|model|SIDE x 100}",
+        "average depth {heads|average depth, constant answer (control)|SIDE x 100}",
+        "nothing",
+    ),
+    (
+        "12 generated people, unseen light and view",
+        "{people|geometry + albedo|generated people}",
+        "HOG with mirror image {people|HOG with mirror image (control)|generated people}",
+        "nothing",
+    ),
+    (
+        "31 people of LFW, accuracy",
+        "{people|geometry + albedo|LFW}",
+        "LBP with mirror image {people|LBP with mirror image (control)|LFW}",
+        "beyond 77°: Gradientfaces {identity|Gradientfaces (control)|beyond} to "
+        "{identity|geometry + albedo|beyond}",
+    ),
+    (
+        "19 face parts from 640 masks, mIoU",
+        "{segmentation|joint encoders and decoder, distilled|640 masks}",
+        "two fresh encoders {segmentation|random start, joint (control)|640 masks}",
+        "100 masks: PCA "
+        "{segmentation|PCA (64), each place's classes by linear regression (control)|100 masks} to "
+        "{segmentation|joint encoders and decoder, distilled|100 masks}",
+    ),
+    (
+        "depth of generated cars, SIDE x 100 (low)",
+        "{heads|`cars-64`, generated cars|SIDE x 100}",
+        "average depth {heads|average depth of cars (control)|SIDE x 100}",
+        "the control wins",
+    ),
+)
 
 
-def cell(entry: Any, digits: int, best: float | None) -> str:
-    """A number with its interval or its standard deviation."""
-    if entry is None:
-        return ""
-    if isinstance(entry, str):
-        return re.sub(r"\{(.+?)\}", looked_up, entry)
-    text = f"{value_of(entry):,.{digits}f}"
-    text = f"**{text}**" if value_of(entry) == best else text
-    if isinstance(entry, dict) and "low" in entry:
-        return f"{text} ({entry['low']:.{digits}f}-{entry['high']:.{digits}f})"
-    return f"{text} ± {entry['spread']:.{digits}f}" if isinstance(entry, dict) and "spread" in entry else text
+def segmented(result: Any) -> Iterator[list[str]]:
+    """mIoU of each network with fewer and fewer masks, and the paper's."""
+    fewer = {row["name"]: row for row in kept("tables/segmentation-masks.json")["rows"]}
+    yield ["mIoU", *(f"{count} masks" for count in fewer), "the paper"]
+    for row, key in zip(
+        result["rows"], ("distilled", "random_joint", "random_one", "pca", "place"), strict=False
+    ):
+        scores = [
+            line[key] if isinstance(line[key], dict) else {"value": line[key]} for line in fewer.values()
+        ]
+        cells = [
+            f"{one['value']:.3f}" + (f" ± {one['spread']:.3f}" if "spread" in one else "") for one in scores
+        ]
+        note = " (control)" * row.get("control", False)
+        yield [row["name"] + note, *cells, f"{row['paper_miou']:.3f}" if "paper_miou" in row else ""]
 
 
-def edits(which: str, angles: dict[str, str]) -> Callable[[Any], Iterator[list[str]]]:
+def edits(which: str, angles: Mapping[str, str], names: Mapping[str, str]) -> Reader:
     """PSNR and SSIM of edited photographs by angle."""
-    names = {
-        "derender": "derender, photograph's own pixels", "--detail model": "derender, `--detail model`",
-        "the same scene, model's colours": "model's rendering of the same scene",
-        "input": "unchanged photograph",
-        "input, brightness of the truth": "unchanged, brightness of the truth",
-        "input turned as a plane": "turned as a plane",
-        "another person's ratio": "ratio of another person's photographs",
-    }  # fmt: skip
 
     def read(result: Any) -> Iterator[list[str]]:
         yield ["PSNR, dB / SSIM", *angles.values()]
-        for name, scores in result[which].items():
-            shown = (scores.get(angle) for angle in angles)
-            cells = [
-                f"{psnr:.1f} / {ssim:.3f}" if psnr else "" for psnr, ssim in (s or (0, 0) for s in shown)
-            ]
-            yield [names.get(name, name), *cells]
+        for name, title in names.items():
+            shown = (result[which][name].get(angle) for angle in angles)
+            yield [title, *("" if one is None else f"{one[0]:.1f} / {one[1]:.3f}" for one in shown)]
 
     return read
 
 
-def scored(columns: dict[str, tuple[str, float, int]], *where: str) -> Callable[[Any], Iterator[list[str]]]:
-    """Rows of a protocol: for each head the score, what it is multiplied by, and its digits."""
-
-    def read(result: Any) -> Iterator[list[str]]:
-        for key in where:
-            result = result[key]
-        yield ["", *columns]
-        for name, row in result.items():
-            note = " (control)" if row["control"] else ""
-            yield [name + note, *(shown(row["scores"].get(key), by, n) for key, by, n in columns.values())]
-
-    def shown(score: Any, by: float, digits: int) -> str:
-        if score is None or score["value"] is None:
-            return ""
-        value, low, high = (None if score[k] is None else by * score[k] for k in ("value", "low", "high"))
-        text = f"{value:.{digits}f}"
-        return text if low is None else f"{text} ({low:.{digits}f}-{high:.{digits}f})"
-
-    return read
+def edits_of_yale(result: Any) -> Iterator[list[str]]:
+    """The same, then the light predicted from another person's image, beside the mean image in that light."""
+    yield from edits(
+        "yale", LIGHTS, EDITS | {"another person's ratio": "ratio of another person's photographs"}
+    )(result)
+    lit = kept("relighting.json")
+    for name, title in RELIT.items():
+        scores = [[lit[key][name]["scores"][angle]["value"] for key in ("psnr", "ssim")] for angle in LIT]
+        yield [title, *(f"{psnr:.1f} / {ssim:.3f}" for psnr, ssim in scores)]
 
 
-def with_steps(read: Callable[[Any], Iterator[list[str]]], file: str) -> Callable[[Any], Iterator[list[str]]]:
-    """The rows of a table, above them its first row with 20 steps per image, from a file of its own."""
-
-    def both(result: Any) -> Iterator[list[str]]:
-        head, *rows = read(result)
-        _, first, *_ = read(kept(file))
-        yield from (head, [f"{first[0]}, 20 steps per image", *first[1:]], *rows)
-
-    return both
-
-
-def side_by_side(heads: Mapping[str, str], key: str) -> Callable[[Any], Iterator[list[str]]]:
-    """One score of the same rows in several files of benchmarks/results/published, by the head of each."""
-
-    def read(_: Any) -> Iterator[list[str]]:
-        yield ["", *heads]
-        files = [kept(f"published/{name}.json") for name in heads.values()]
-        for name, row in files[0]["rows"].items():
-            note = " (control)" if row["control"] else ""
-            shown = (file["rows"][name]["scores"][key]["value"] for file in files)
-            yield [name + note, *(f"{value:.3f}" for value in shown)]
-
-    return read
+EDITS = {
+    "derender": "derender, photograph's own pixels",
+    "the same scene, model's colours": "model's rendering of the same scene",
+    "input, brightness of the truth": "unchanged, brightness of the truth",
+}
+LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
+LIT = [f"<= {angle}" for angle in (12, 25, 50, 77)] + ["beyond"]
+RELIT = {
+    "photograph relit": "light predicted from another person: derender",
+    "mean image": "mean image of the others in that light",
+}
+HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
+    "view 15": "view 15°",
+    "view 30": "view 30°",
+}
 
 
 def turned_and_lit(_: Any) -> Iterator[list[str]]:
@@ -175,24 +163,33 @@ ROBUST = {
 }  # fmt: skip
 
 
-def part(name: str, digits: Mapping[str, int]) -> Callable[[Any], Iterator[list[str]]]:
-    """One part of a file as it is, its rows by name."""
-
-    def read(result: Any) -> Iterator[list[str]]:
-        yield ["", *digits]
-        for row, scores in result[name].items():
-            yield [row, *(f"{scores[key]:.{number}f}" for key, number in digits.items())]
-
-    return read
+def demo(result: Any) -> Iterator[list[str]]:
+    """What the demo's own model reaches, each score beside its strongest control."""
+    yield ["", "this run", "strongest control"]
+    depth, people, images = result["geometry"], result["clustering"], result["reconstruction"]
+    for how in ("40 steps per image", "feed-forward"):
+        row = f"{depth[f'this run, {how}']['SIDE x 100']:.3f}"
+        yield [
+            f"depth, SIDE x 100, {how} (low)",
+            row,
+            f"average depth {depth['average depth']['SIDE x 100']:.3f}",
+        ]
+    own, *controls = people
+    best = max(controls, key=lambda name: people[name]["accuracy"])
+    yield ["people, accuracy", f"{people[own]['accuracy']:.3f}", f"{best} {people[best]['accuracy']:.3f}"]
+    own, *controls = images
+    best = min(controls, key=lambda name: images[name]["L1"])
+    yield ["reconstruction, L1 (low)", f"{images[own]['L1']:.4f}", f"{best} {images[best]['L1']:.4f}"]
 
 
 def probed(result: Any) -> Iterator[list[str]]:
-    """Balanced accuracy of each probe and number of labels."""
+    """Balanced accuracy of each probe with few and with many labels."""
     names = [name for name in result["parts"][0]["rows"] if name not in ("majority", "chance")]
     yield ["probe, labels", *(name if name == names[0] else f"{name} (control)" for name in names)]
     for part in result["parts"]:
-        scores = (part["rows"][name]["scores"]["balanced_accuracy"]["value"] for name in names)
-        yield [f"{part['head']}, {part['labels']:,}", *(f"{score:.3f}" for score in scores)]
+        if part["labels"] != 500:
+            scores = (part["rows"][name]["scores"]["balanced_accuracy"]["value"] for name in names)
+            yield [f"{part['head']}, {part['labels']:,}", *(f"{score:.3f}" for score in scores)]
 
 
 RUNGS = {
@@ -200,42 +197,29 @@ RUNGS = {
     "r3": "+ cycle term", "r4": "+ stronger LOOCC", "r5": "+ whitening", "r6": "+ distillation",
     "r7": "+ 60 steps per image",
 }  # fmt: skip
-
-
-def averaged(result: Any, title: str, names: Mapping[str, str]) -> Iterator[list[str]]:
-    """Means and deviations over the seeds that did not collapse, of each kind of run named."""
-    keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3, "Yale B <= 50": 3}
-    yield [title, "whole runs", *RUNG_TITLES]
-    for rung, name in names.items():
-        seeds = [row for row in result["rows"] if row["rung"] == rung]
-        whole = [row for row in seeds if not row["collapsed"]]
-        if seeds:
-            values = {key: [row[key] for row in whole if key in row] for key in keys}
-            cells = (spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
-            yield [name, f"{len(whole)} of {len(seeds)}", *cells]
-
-
-def joint(result: Any) -> Iterator[list[str]]:
-    names = {"factor": "one contrast for each factor", "joint": "codes side by side (Eq. 6)"}
-    return averaged(result, "LOOCC", names)
+LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi"}
+LADDER_DEPTH = {"average depth": "average depth", "untrained encoder": "untrained model"}
 
 
 def ladder(result: Any) -> Iterator[list[str]]:
-    yield from averaged(result, "each row adds to the one above", RUNGS)
+    """Means and deviations over the seeds that did not collapse, then controls."""
+    keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3}
+    yield ["each row adds to the one above", "whole runs", "SIDE x 100", "tracks, NMI", "LFW, NMI"]
+    for rung, name in RUNGS.items():
+        seeds = [row for row in result["rows"] if row["rung"] == rung]
+        whole = [row for row in seeds if not row["collapsed"]]
+        values = {key: [row[key] for row in whole if key in row] for key in keys}
+        cells = (spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
+        yield [name, f"{len(whole)} of {len(seeds)}", *cells]
     controls = {file: kept(file)["rows"] for file in LADDER_CONTROLS}
     depth = kept("generated/heads.json")["intervals"]["geometry"]
     side = {name: f"{100 * depth[row]['scores']['side']['value']:.2f}" for name, row in LADDER_DEPTH.items()}
-    yield ["average depth (control)", "", side["average depth"], "", "", ""]
+    yield ["average depth (control)", "", side["average depth"], "", ""]
     for name in ("untrained encoder", "PCA (64)", "pixels"):
         scores = (
             f"{controls[file][name]['scores'][key]['value']:.3f}" for file, key in LADDER_CONTROLS.items()
         )
         yield [f"{name} (control)", "", side.get(name, ""), *scores]
-
-
-LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi", "identity_all.json": "<= 50"}
-LADDER_DEPTH = {"average depth": "average depth", "untrained encoder": "untrained model"}
-RUNG_TITLES = ("SIDE x 100", "tracks, NMI", "LFW, NMI", "Yale B to 50°")
 
 
 def sharp(result: Any) -> Iterator[list[str]]:
@@ -254,28 +238,28 @@ def true_factors(result: Any) -> Iterator[list[str]]:
         yield [name, *(f"{round(score, 2) + 0:.2f}" for score in scores)]
 
 
-def disentangled(result: Any) -> Iterator[list[str]]:
-    """Similarity between factors and the swap test, of the model and each control."""
-    columns = ("Pearson per dimension", "CKA", "cross R2", "swap test, features", "swap test, decoded")
-    yield ["", *columns]
-    for name, (row, *_) in result["rows"].items():
-        alike, swap = row["similarity"] or {}, row["swap"] or {}
-        values = [
-            (row["pearson"]["mean_per_dimension"], 3), (alike.get("mean_cka_unbiased"), 3),
-            (alike.get("mean_cross_r2"), 3), (swap.get("ratio"), 2), (swap.get("ratio_parameters"), 2),
-        ]  # fmt: skip
-        label = name if name == "model" else f"{name} (control)"
-        yield [label, *("" if value is None else f"{value:.{digits}f}" for value, digits in values)]
+def disentangled(_: Any) -> Iterator[list[str]]:
+    """Similarity between factors and the swap test of two sets, of the models and each control."""
+    yield ["", *(f"{what}: {name}" for what in DISENTANGLED for name in LIKENESS)]
+    files = [kept(file)["rows"] for file in DISENTANGLED.values()]
+    for name in files[0]:
+        cells = [
+            mean(seeds, *where) for file in files for seeds in [file[name]] for where in LIKENESS.values()
+        ]
+        yield [name if name == "model" else f"{name} (control)", *cells]
 
 
-def swapped(result: Any) -> Iterator[list[str]]:
-    """How far each feature moves towards its donor's where one factor was exchanged."""
-    swap = result["rows"]["model"][0]["swap"]
-    yield ["", *swap["factors"]]
-    for name, row in zip(swap["factors"], swap["moved"], strict=True):
-        yield [f"{name} exchanged", *(f"{value:.2f}" for value in row)]
-    unexchanged = (f"{value:.2f}" for value in swap["unexchanged"])
-    yield ["nothing exchanged, rendered and encoded again", *unexchanged]
+def mean(seeds: Sequence[Any], part: str, key: str, digits: int) -> str:
+    """The mean of one number over seeds, nothing where there is none."""
+    values = [one[part][key] for one in seeds if one[part]]
+    return f"{fmean(values):.{digits}f}" if values else ""
+
+
+DISENTANGLED = {"heads": "true-factors.json", "LFW": "published/disentanglement-lfw.json"}
+LIKENESS = {
+    "Pearson": ("pearson", "mean_per_dimension", 3),
+    "swap test": ("swap", "ratio", 2),
+}
 
 
 def aligned(result: Any) -> Iterator[list[str]]:
@@ -294,102 +278,89 @@ def framings(result: Any) -> Iterator[list[str]]:
         yield [name, *(f"{row[key]:.3f}" for key in keys)]
 
 
-def angles(result: Any) -> Iterator[list[str]]:
+def angles(_: Any) -> Iterator[list[str]]:
     """Correlation, slope and error of each angle, beside the error of a constant answer."""
     yield ["angle", "r", "slope", "error, degrees", "constant answer, degrees"]
-    for name in ("yaw", "pitch", "roll", "azimuth", "elevation"):
-        if name in result:
+    for file, (names, note) in ANGLES.items():
+        result = kept(file)
+        for name in names:
             model = {key: score["value"] for key, score in result[name]["model"]["scores"].items()}
             control = result[name]["constant answer"]["scores"]["error"]["value"]
             cells = [f"{model[key]:.3f}" for key in ("r", "slope")] + [f"{model['error']:.1f}"]
-            yield [name, *cells, f"{control:.1f}"]
+            yield [name + note, *cells, f"{control:.1f}"]
 
 
-BINS = {f"to {angle}°": (f"<= {angle}", 1, 3) for angle in (25, 50, 77)} | {"beyond": ("beyond", 1, 3)}
-PSNR = {f"to {angle}°": (f"<= {angle}", 1, 1) for angle in (12, 25, 50, 77)} | {"beyond": ("beyond", 1, 1)}
-PAIRS = {"accuracy": ("accuracy", 1, 3), "AUC": ("auc", 1, 3)}
-CLUSTERS = {"accuracy": ("accuracy", 1, 3), "NMI": ("nmi", 1, 3), "ARI": ("ari", 1, 3)}
-DEPTH = {"SIDE x 100": ("side", 100, 3), "MAD, degrees": ("mad_deg", 1, 1)}
-FACTORS = {
-    "albedo": ("albedo", 1, 3),
-    "lighting, degrees": ("light", 1, 1),
-    "viewpoint, degrees": ("camera", 1, 1),
+ANGLES = {
+    "pose.json": (("yaw", "pitch", "roll"), " of the head"),
+    "light.json": (("azimuth", "elevation"), " of the light"),
+    "light-optimised.json": (("azimuth", "elevation"), ", 10 steps per image"),
 }
-LARGE = {"CelebA, 40 attributes": "celeba", "UTKFace, 5 races": "races"}
-IMAGES = {"L1": ("l1", 1, 4), "PSNR, dB": ("psnr_db", 1, 2), "SSIM": ("ssim", 1, 3)}
-GEOMETRY, TRUE, FITTED = ("intervals", "geometry"), ("intervals", "factors"), "generated/heads-fitted.json"
-BRIGHTNESS = {"correlation": ("r", 1, 3), "slope": ("slope", 1, 3), "error": ("error", 1, 4)}
-LIGHTS = {f"up to {angle}": f"up to {angle}°" for angle in (12, 25, 50, 77)} | {"beyond": "beyond 77°"}
-HEADS = {f"light {angle}": f"light {angle}°" for angle in (25, 45, 65)} | {
-    "view 15": "view 15°",
-    "view 30": "view 30°",
-}
-FILES: dict[str, tuple[str, Callable[[Any], Iterator[list[str]]]]] = {  # files, the first for the reader
-    "edits-yale": ("photo_edits.json", edits("yale", LIGHTS)),
-    "edits-heads": ("photo_edits.json", edits("generated heads", HEADS)),
-    "training-step": ("training_step.json", speed.training_step),
-    "rasterize": ("rasterize.json", speed.rasterize),
-    "peers": ("rasterize_peers.json", speed.peers),
-    "reading": ("reading.json", speed.reading),
-    "memory": ("embedding_memory.json", speed.memory),
-    "step-memory": ("step_memory.json", speed.step_memory),
-    "million": ("clustering_million.json", speed.million),
-    "true-factors": ("true-factors.json", true_factors),
-    "disentanglement-generated": ("true-factors.json", disentangled),
-    "swap-matrix-generated": ("true-factors.json", swapped),
-    "bench": ("bench.json", speed.shares),
-    "step-profile": ("step_profile.json", speed.profiled),
-    "compiled-step": ("compiled_step.json", speed.compiled),
-    "gpu-steps": ("gpu.json", speed.gpu_steps),
-    "gpu-agreement": ("gpu.json", speed.gpu_agreement),
-    "fitting": ("fitting.json", speed.fitting),
-    "disentangling": ("fitting.json", speed.disentangling),
-    "heads-generated": (f"generated/heads.json {FITTED}", with_steps(scored(DEPTH, *GEOMETRY), FITTED)),
-    "faces-128": ("sharpness.json", sharp),
-    "heads-128": ("generated/heads-128.json", scored(DEPTH, *GEOMETRY)),
-    "factors-generated": (f"generated/heads.json {FITTED}", with_steps(scored(FACTORS, *TRUE), FITTED)),
-    "people-lfw": ("published/lfw.json", scored(CLUSTERS, "rows")),
-    "people-lfw-fitted": ("published/lfw-fitted.json", scored(CLUSTERS, "rows")),
-    "people-lfw-finch": ("published/lfw-finch.json", scored(CLUSTERS, "rows")),
-    "disentanglement-lfw": ("published/disentanglement-lfw.json", disentangled),
-    "reconstruction-utkface": ("published/reconstruction-utkface.json", scored(IMAGES, "intervals")),
-    "reconstruction-lfw": (
-        "published/reconstruction-lfw.json published/reconstruction-lfw-fitted.json",
-        with_steps(scored(IMAGES, "intervals"), "published/reconstruction-lfw-fitted.json"),
+
+
+def killed(result: Any) -> Iterator[list[str]]:
+    """Kills of each group of commands: how many hit a file being written, and how the runs ended."""
+    yield ["commands", "kills", "while writing", "runs that end bit-identical", "faults"]
+    for names in KILLED:
+        rows = [result["commands"][name] for name in names]
+        kills, writing, rounds, survived = (
+            sum(row[key] for row in rows) for key in ("kills", "writing", "rounds", "survived")
+        )
+        shown = ", ".join(f"`{KILLED_AS.get(name, name)}`" for name in names)
+        yield [
+            shown,
+            f"{kills}",
+            f"{writing}",
+            f"{survived} of {rounds}",
+            f"{sum(len(row['faults']) for row in rows)}",
+        ]
+
+
+KILLED = (
+    ("train", "finetune"), ("embed", "compare", "identify", "plan"), ("explain", "report"),
+    ("whiten", "refine", "unet", "pack"),
+    ("align", "decompose", "mesh", "relight", "rotate", "swap", "video"),
+)  # fmt: skip
+KILLED_AS = {"identify": "evaluate identify", "plan": "compare --plan", "video": "relight CLIP"}
+
+FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for the reader
+    "segmentation": ("tables/segmentation.json tables/segmentation-masks.json", segmented),
+    "summary": (
+        f"{HEADS_FILE} generated/people.json {LFW} identity.json {CARS} tables/segmentation.json",
+        summary,
     ),
-    "large-classes": ("published/celeba.json published/races.json", side_by_side(LARGE, "accuracy")),
+    "faces-128": ("sharpness.json", sharp),
+    "edits-yale": ("photo_edits.json relighting.json", edits_of_yale),
+    "edits-heads": (
+        "photo_edits.json",
+        edits("generated heads", HEADS, EDITS | {"input turned as a plane": "turned as a plane"}),
+    ),
+    "angles": (" ".join(ANGLES), angles),
+    "robustness": (" ".join(ROBUST.values()), turned_and_lit),
+    "true-factors": ("true-factors.json", true_factors),
+    "disentanglement": (" ".join(DISENTANGLED.values()), disentangled),
     "celeba-labels": ("published/celeba-labels.json", probed),
-    "robustness-generated": (" ".join(ROBUST.values()), turned_and_lit),
     "paper-clustering": (
         " ".join(f"published/compare-{one}.json" for one in theirs.PARTS),
         theirs.beside_the_paper,
     ),
     "paper-linear": ("published/compare-linear.json", theirs.few_labels),
-    "demo-depth": ("demo.json", part("geometry", {"SIDE x 100": 3, "MAD": 1})),
-    "demo-people": ("demo.json", part("clustering", {"accuracy": 3, "NMI": 3})),
-    "demo-images": ("demo.json", part("reconstruction", {"L1": 4, "PSNR": 2, "SSIM": 3})),
-    "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
-    "loocc-joint": ("loocc-joint.json", joint),
     "paper-gpu": ("paper-gpu.json", theirs.preset),
-    "brightness-generated": ("generated/brightness.json", scored(BRIGHTNESS, "brightness")),
-    "identity": ("identity.json", scored(BINS | {"Ward": ("ward accuracy", 1, 3)}, "rows")),
-    "verification": ("verification.json", scored(PAIRS, "rows")),
-    "pose": ("pose.json", angles),
-    "light": ("light.json", angles),
-    "light-optimised": ("light-optimised.json", angles),
-    "relighting": ("relighting.json", scored(PSNR, "psnr")),
+    "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
+    "demo": ("demo.json", demo),
     "renderers": ("renderers_fit.json", drawn.renderers),
     "renderers-speed": ("renderers_speed.json", drawn.renderer_speed),
     "renderers-train": ("renderers_train.json", drawn.renderers_trained),
-    "renderers-clear": ("renderers_train.json", lambda result: drawn.renderers_trained(result, clear=True)),
-    "renderers-numbers": ("renderers_train.json", drawn.effect_numbers),
-    "renderers-yale": ("renderers_yaleb.json", drawn.renderers_yale),
-    "table-million": ("table_million.json", speed.million_rows),
-    "view": ("view.json", speed.page_speed),
+    "kills": ("kills.json", killed),
     "align": ("align.json", aligned),
     "framings": ("align.json", framings),
-    "brightness-races": ("brightness-races.json", scored({"share of brightness": ("share", 1, 3)}, "share")),
-    "people-generated": ("generated/people.json", scored(CLUSTERS, "rows")),
-    "cars-generated": ("generated/cars-clusters.json", scored(CLUSTERS, "rows")),
-    "cars-depth-generated": ("generated/cars-geometry.json", scored(DEPTH, "intervals", "geometry")),
+    "bench": ("bench.json", speed.shares),
+    "training-step": ("training_step.json", speed.training_step),
+    "gpu-steps": ("gpu.json", speed.gpu_steps),
+    "fitting": ("fitting.json", speed.fitting),
+    "rasterize": ("rasterize.json", speed.rasterize),
+    "peers": ("rasterize_peers.json", speed.peers),
+    "step-memory": ("step_memory.json", speed.step_memory),
+    "reading": ("reading.json", speed.reading),
+    "million": ("clustering_million.json", speed.million),
+    "table-million": ("table_million.json", speed.million_rows),
 }

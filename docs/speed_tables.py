@@ -41,15 +41,6 @@ def reading(result: Any) -> Iterator[list[str]]:
         ]
 
 
-def memory(result: Any) -> Iterator[list[str]]:
-    yield ["images embedded", "highest memory, MB", "before the first image, MB", "CPU s"]
-    for row in result["rows"]:
-        yield [
-            f"{row['pictures']:,}",
-            *(f"{row[key]:,.0f}" for key in ("peak_mb", "before_mb", "cpu_seconds")),
-        ]
-
-
 def step_memory(result: Any) -> Iterator[list[str]]:
     yield ["image size", "whole batch, MB", "four chunks, MB", "whole, CPU s", "four chunks, CPU s"]
     by_size: dict[int, dict[int, Any]] = {}
@@ -75,29 +66,6 @@ def shares(result: Any) -> Iterator[list[str]]:
         yield [row["what"], f"{row['ratio']:.2f}", f"{row['least']:.2f} to {row['most']:.2f}", speeds]
 
 
-def compiled(result: Any) -> Iterator[list[str]]:
-    yield ["step, batch 16", "CPU ms", "compiled, CPU ms", "ratio", "least to most", "compiling, CPU s"]
-    for row in result["rows"]:
-        extras = ", bfloat16" if row["precision"] == "bf16-mixed" else ""
-        spread = f"{row['least']:.2f} to {row['most']:.2f}"
-        times = f"{row['eager_ms']:,.0f}", f"{row['compiled_ms']:,.0f}"
-        what = f"`{row['preset']}`, {row['size']} px{extras}"
-        yield [what, *times, f"{row['ratio']:.2f}", spread, f"{row['compiling_cpu_s']:.0f}"]
-
-
-def profiled(result: Any) -> Iterator[list[str]]:
-    yield ["", *(f"`{row['preset']}`, {row['size']} px" for row in result["rows"])]
-    first = result["rows"][0]["shares"]
-    for name in sorted(first, key=lambda name: -first[name]):
-        yield [name, *(f"{100 * row['shares'][name]:.0f} %" for row in result["rows"])]
-    yield ["GFLOP an image", *(f"{row['gflop_per_image']:.1f}" for row in result["rows"])]
-    yield ["GFLOP a CPU second, whole step", *(f"{row['gflop_per_cpu_s']:.0f}" for row in result["rows"])]
-    yield [
-        "the same, 2,048 x 2,048 matrix product",
-        *[f"{result['matrix_product']:.0f}"] * len(result["rows"]),
-    ]
-
-
 def fitting(result: Any) -> Iterator[list[str]]:
     size = f"{result['images']} scenes of 64 pixels, one thread"
     yield [size, "steps", "CPU ms an image", "SIDE x 100", "normals", "error of images"]
@@ -105,12 +73,6 @@ def fitting(result: Any) -> Iterator[list[str]]:
     for name, row in result["rows"].items():
         scores = f"{row['side']:.3f}", f"{row['mad_deg']:.1f}°", f"{row['error']:.4f}"
         yield [name, str(row["steps"]), f"{row['ms_per_image']:.1f}", *scores]
-
-
-def disentangling(result: Any) -> Iterator[list[str]]:
-    yield [f"`evaluate disentangle`, {result['disentangle_images']} images, one thread", "CPU s", "swap test"]
-    for name, row in result["rows"].items():
-        yield [name, f"{row['disentangle_s']:.1f}", f"{row['swap_ratio']:.2f}"]
 
 
 def gpu_steps(result: Any) -> Iterator[list[str]]:
@@ -129,14 +91,6 @@ def gpu_steps(result: Any) -> Iterator[list[str]]:
         yield [what, one, f"{fast:,.0f}", ratio, f"{rows['auto']['memory_gb']:.1f}"]
 
 
-def gpu_agreement(result: Any) -> Iterator[list[str]]:
-    gradients = [key for key in result["agreement"][0] if key.startswith("gradient")]
-    yield ["Triton beside plain torch", "image", "depth", "mask", "largest of four gradients"]
-    for row in result["agreement"]:
-        errors = row["image"], row["depth"], row["mask"], max(row[key] for key in gradients)
-        yield [f"{row['size']} px, {row['dtype']}", *(f"{error:.0e}" if error else "0" for error in errors)]
-
-
 def million_rows(result: Any) -> Iterator[list[str]]:
     yield ["1,000,000 rows of 128, one thread", "seconds"]
     names = {
@@ -147,10 +101,3 @@ def million_rows(result: Any) -> Iterator[list[str]]:
         "duckdb_count": "DuckDB, rows of each kind",
     }
     yield from ([name, f"{result['seconds'][key]:.2f}"] for key, name in names.items())
-
-
-def page_speed(result: Any) -> Iterator[list[str]]:
-    yield ["image, clients at once", "images a CPU second", "CPU ms an image", "memory, MB"]
-    for row in result["rows"]:
-        cells = (row[key] for key in ("pictures_per_cpu_second", "cpu_ms", "server_mb"))
-        yield [f"{row['size']} pixels, {row['clients']}", *(f"{cell:,.0f}" for cell in cells)]
