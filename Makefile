@@ -33,7 +33,7 @@ release: $(STAMP)  ## licences and known advisories of every package, into build
 # stopped run goes on where it was. `make results RESULTS=folder` leaves the files of the repository alone.
 RESULTS := benchmarks/results/generated
 DATA := build/results
-SCORES := heads heads-fitted heads-128 brightness people cars-clusters cars-geometry robustness-faces robustness-cars
+SCORES := heads heads-fitted heads-128 brightness people disentanglement cars-clusters cars-geometry robustness-faces robustness-cars
 results: $(STAMP) $(SCORES:%=$(RESULTS)/%.json)  ## repeat the results on generated images (tens of minutes, resumable)
 	@$(BIN)/python docs/pages.py
 
@@ -60,6 +60,8 @@ $(RESULTS)/brightness.json: | $(DATA)/faces
 	$(SCORE) $(BRIGHTNESS)
 $(RESULTS)/people.json: | $(DATA)/faces
 	$(SCORE) $(PEOPLE)
+$(RESULTS)/disentanglement.json: | $(DATA)/faces
+	$(SCORE) evaluate disentangle $(DATA)/faces/test --model rendered-faces-64 --limit 300 --seeds 1
 $(RESULTS)/cars-clusters.json: | $(DATA)/cars
 	$(SCORE) $(CARS-CLUSTERS)
 $(RESULTS)/cars-geometry.json: | $(DATA)/cars
@@ -69,10 +71,11 @@ $(RESULTS)/robustness-faces.json: | $(STAMP)
 $(RESULTS)/robustness-cars.json: | $(STAMP)
 	$(SCORE) evaluate robustness --model cars-64 --pictures cars
 
-# Results on sets that come from their owners: lfw64.zip, utkface64.zip and celeba64.zip in IMAGES, aligned, 64 pixels.
+# Results on sets that come from their owners: lfw64.zip, utkface64.zip and celeba64.zip in IMAGES, aligned, 64 pixels;
+# the cropped Extended Yale B as yaleb.zip, and pairs.txt of LFW.
 PUBLISHED := benchmarks/results/published
 LFW := --label identity --min-count 20 --max-count 20
-published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make published IMAGES=folder (two hours, resumable)
+published: $(STAMP)  ## repeat results on LFW, UTKFace, CelebA and Yale B: make published IMAGES=folder (hours, resumable)
 	@mkdir -p build; test -f build/lfw-fitted.parquet || $(BIN)/derender embed $(IMAGES)/lfw64.zip --model faces-64 \
 	  --fit-steps 20 --keep-duplicates --out build/lfw-fitted.parquet
 	@for step in "lfw evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW)" \
@@ -85,6 +88,12 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace and CelebA: make publishe
 	  "races evaluate cluster $(IMAGES)/utkface64.zip --model faces-64 --limit 4000 --label race --resamples 200" \
 	  "celeba-labels evaluate linear $(IMAGES)/celeba64.zip --model faces-64 --attributes --heads linear,centred,logistic --resamples 200 --seeds 1" \
 	  "robustness-lfw evaluate robustness $(IMAGES)/lfw64.zip --model faces-64 --pictures render $(LFW)" \
+	  "identity evaluate identify $(IMAGES)/yaleb.zip --model faces-64 --half test" \
+	  "light evaluate light $(IMAGES)/yaleb.zip --half test --model faces-64" \
+	  "light-optimised evaluate light $(IMAGES)/yaleb.zip --half test --model faces-64 --fit-steps 10" \
+	  "relighting evaluate relight $(IMAGES)/yaleb.zip --half test --model faces-64" \
+	  "verification evaluate verify $(IMAGES)/lfw64.zip --pairs $(IMAGES)/pairs.txt --half test --model faces-64" \
+	  "brightness-races evaluate brightness $(IMAGES)/utkface64.zip --model faces-64 --by race --limit 2000" \
 	  "compare-linear compare --table linear --model faces-64 $(IMAGES)/celeba64.zip --finetune --supervised --seeds 1 --untrained-seeds 1" \
 	  "compare-identity compare --table identity --model faces-64 $(IMAGES)/lfw64.zip" \
 	  "compare-emotion compare --table emotion --model faces-64 $(IMAGES)/lfw64.zip" \

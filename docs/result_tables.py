@@ -119,7 +119,7 @@ def edits_of_yale(result: Any) -> Iterator[list[str]]:
     yield from edits(
         "yale", LIGHTS, EDITS | {"another person's ratio": "ratio of another person's photographs"}
     )(result)
-    lit = kept("relighting.json")
+    lit = kept("published/relighting.json")
     for name, title in RELIT.items():
         scores = [[lit[key][name]["scores"][angle]["value"] for key in ("psnr", "ssim")] for angle in LIT]
         yield [title, *(f"{psnr:.1f} / {ssim:.3f}" for psnr, ssim in scores)]
@@ -255,7 +255,7 @@ def mean(seeds: Sequence[Any], part: str, key: str, digits: int) -> str:
     return f"{fmean(values):.{digits}f}" if values else ""
 
 
-DISENTANGLED = {"heads": "true-factors.json", "LFW": "published/disentanglement-lfw.json"}
+DISENTANGLED = {"heads": "generated/disentanglement.json", "LFW": "published/disentanglement-lfw.json"}
 LIKENESS = {
     "Pearson": ("pearson", "mean_per_dimension", 3),
     "swap test": ("swap", "ratio", 2),
@@ -292,8 +292,8 @@ def angles(_: Any) -> Iterator[list[str]]:
 
 ANGLES = {
     "pose.json": (("yaw", "pitch", "roll"), " of the head"),
-    "light.json": (("azimuth", "elevation"), " of the light"),
-    "light-optimised.json": (("azimuth", "elevation"), ", 10 steps per image"),
+    "published/light.json": (("azimuth", "elevation"), " of the light"),
+    "published/light-optimised.json": (("azimuth", "elevation"), ", 10 steps per image"),
 }
 
 
@@ -325,18 +325,18 @@ KILLED_AS = {"identify": "evaluate identify", "plan": "compare --plan", "video":
 FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for the reader
     "segmentation": ("tables/segmentation.json tables/segmentation-masks.json", segmented),
     "summary": (
-        f"{HEADS_FILE} generated/people.json {LFW} identity.json {CARS} tables/segmentation.json",
+        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json {CARS} tables/segmentation.json",
         summary,
     ),
     "faces-128": ("sharpness.json", sharp),
-    "edits-yale": ("photo_edits.json relighting.json", edits_of_yale),
+    "edits-yale": ("photo_edits.json published/relighting.json", edits_of_yale),
     "edits-heads": (
         "photo_edits.json",
         edits("generated heads", HEADS, EDITS | {"input turned as a plane": "turned as a plane"}),
     ),
     "angles": (" ".join(ANGLES), angles),
     "robustness": (" ".join(ROBUST.values()), turned_and_lit),
-    "true-factors": ("true-factors.json", true_factors),
+    "true-factors": ("generated/disentanglement.json", true_factors),
     "disentanglement": (" ".join(DISENTANGLED.values()), disentangled),
     "celeba-labels": ("published/celeba-labels.json", probed),
     "paper-clustering": (

@@ -69,7 +69,7 @@ GEOMETRY, TRUE = "intervals geometry", "intervals factors"
 AVERAGE = ("average depth", "constant answer")
 LFW, LFW_FITTED = "published/lfw.json", "published/lfw-fitted.json"
 UTK_IMAGES, LFW_IMAGES = "published/reconstruction-utkface.json", "published/reconstruction-lfw.json"
-BRIGHT = "generated/brightness.json"
+BRIGHT, IDENTITY = "generated/brightness.json", "published/identity.json"
 BINS = {"to 50°": ("<= 50", False), "to 77°": ("<= 77", True), "beyond": ("beyond", True)}
 DESCRIPTORS = ("Gradientfaces", "HOG", "LBP")
 PLAIN = ("untrained encoder", "PCA (64)", "pixels")
@@ -98,18 +98,20 @@ SIDE_BY_SIDE: dict[str, tuple[str, Reader]] = {
             "generated people": Score("generated/people.json", "rows", "accuracy", intervals=True),
             "LFW": Score(LFW, "rows", "accuracy", intervals=True),
             "LFW, NMI": Score(LFW, "rows", "nmi"),
-            "pairs of LFW": Score("verification.json", "rows", "accuracy", intervals=True),
+            "pairs of LFW": Score("published/verification.json", "rows", "accuracy", intervals=True),
             "classes of cars": Score("generated/cars-clusters.json", "rows", "accuracy"),
         },
         [
             *lines("geometry + albedo", control=False),
             Line("the same, 20 steps per image", ("geometry + albedo",), {LFW: LFW_FITTED}),
-            *lines(*PLAIN, *(f"{name} with mirror image" for name in DESCRIPTORS), "majority", "chance"),
+            *lines(
+                *PLAIN, *(f"{name} with mirror image" for name in DESCRIPTORS), "LBP", "majority", "chance"
+            ),
         ],
     ),
     "identity": side_by_side(
-        {name: Score("identity.json", "rows", key, intervals=wide) for name, (key, wide) in BINS.items()}
-        | {"Ward": Score("identity.json", "rows", "ward accuracy")},
+        {name: Score(IDENTITY, "rows", key, intervals=wide) for name, (key, wide) in BINS.items()}
+        | {"Ward": Score(IDENTITY, "rows", "ward accuracy")},
         [*lines("geometry + albedo", control=False), *lines(*PLAIN, *DESCRIPTORS, "chance")],
     ),
     "brightness": side_by_side(
@@ -117,7 +119,7 @@ SIDE_BY_SIDE: dict[str, tuple[str, Reader]] = {
             "correlation": Score(BRIGHT, "brightness", "r"),
             "slope": Score(BRIGHT, "brightness", "slope", intervals=True),
             "error": Score(BRIGHT, "brightness", "error", 4),
-            "UTKFace: share": Score("brightness-races.json", "share", "share", intervals=True),
+            "UTKFace: share": Score("published/brightness-races.json", "share", "share", intervals=True),
         },
         [*lines("model", control=False), *lines("untrained model", "image as albedo", "constant answer")],
     ),
