@@ -360,7 +360,6 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     "rasterize": ("rasterize.json", speed.rasterize),
     "peers": ("rasterize_peers.json", speed.peers),
     "step-memory": ("step_memory.json", speed.step_memory),
-    "reading": ("reading.json", speed.reading),
     "million": ("clustering_million.json", speed.million),
     "table-million": ("table_million.json", speed.million_rows),
 }

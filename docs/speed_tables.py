@@ -28,19 +28,6 @@ def peers(result: Any) -> Iterator[list[str]]:
         yield [name, *(f"{row['milliseconds'][name]['both ways']:,.1f}" for row in result["rows"])]
 
 
-def reading(result: Any) -> Iterator[list[str]]:
-    yield ["", "first start, CPU s", "later starts, CPU s", "highest memory, MB"]
-    for name, kind in result["starts"].items():
-        later = ", ".join(f"{one['cpu_s']:.2f}" for one in kind["later"])
-        first = kind["first"]
-        yield [
-            f"{name}, {kind['files']:,} images",
-            f"{first['cpu_s']:.1f}",
-            later,
-            f"{first['memory_mb']:.0f}",
-        ]
-
-
 def step_memory(result: Any) -> Iterator[list[str]]:
     yield ["image size", "whole batch, MB", "four chunks, MB", "whole, CPU s", "four chunks, CPU s"]
     by_size: dict[int, dict[int, Any]] = {}
