@@ -23,7 +23,7 @@ def table(name: str) -> str:
     head, *rows = body(name)
     lines = ["| " + " | ".join(line) + " |" for line in (head, *rows)]
     note = ", ".join(f"`benchmarks/results/{file}`" for file in files.split())
-    note += ", transcribed from output that was not kept" if files.startswith("tables/") else ""
+    note += " (`tables`: transcribed from output that was not kept)" if "tables/" in files else ""
     shown = "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
     return f"{shown}\n\n{textwrap.fill(f'Source: {note}.', 118, break_on_hyphens=False)}\n"
 
@@ -322,10 +322,11 @@ KILLED = (
 )  # fmt: skip
 KILLED_AS = {"identify": "evaluate identify", "plan": "compare --plan", "video": "relight CLIP"}
 
+MASKS = "tables/segmentation.json tables/segmentation-masks.json"
 FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for the reader
-    "segmentation": ("tables/segmentation.json tables/segmentation-masks.json", segmented),
+    "segmentation": (MASKS, segmented),
     "summary": (
-        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json {CARS} tables/segmentation.json",
+        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json {CARS} {MASKS}",
         summary,
     ),
     "faces-128": ("sharpness.json", sharp),
