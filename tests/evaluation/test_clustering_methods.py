@@ -40,9 +40,9 @@ def test_ward_is_scipys_tree(rows, dimensions, seed):
 
 
 @pytest.mark.parametrize("float64_rows", [20_000, 0])
-def test_tiles_and_float32_do_not_change_the_tree(monkeypatch, float64_rows):
+def test_blocks_and_float32_do_not_change_the_tree(monkeypatch, float64_rows):
     features = 100 + groups(203, 1)
-    monkeypatch.setattr(clustering_methods, "TILE", 32)
+    monkeypatch.setattr(clustering_methods, "NUMBERS_AT_ONCE", 600)
     monkeypatch.setattr(clustering_methods, "FLOAT64_ROWS", float64_rows)
     ours, theirs = ward_tree(features), linkage(features, "ward")
     np.testing.assert_allclose(ours[:, 2], theirs[:, 2], rtol=1e-9)

@@ -36,7 +36,7 @@ from derender.evaluation.memory import Memory
 from derender.features import named
 
 FLOAT64_ROWS = 20_000  # above, nearest neighbours are looked up in float32; heights are always float64
-TILE = 1_024
+NUMBERS_AT_ONCE = 1 << 20
 LEAVES = 16_384
 """Clusters that the cells leave; more cannot be asked for."""
 
@@ -145,23 +145,17 @@ def _look(
     square = np.where(sizes > 0, np.einsum("nd,nd->n", means, means), np.inf).astype(dtype)
     with np.errstate(divide="ignore"):
         inverse = np.where(sizes > 0, 1 / sizes, 1).astype(dtype)
-    for start in range(0, len(stale), TILE):
-        rows = stale[start : start + TILE]
-        own, best, where = points[rows] * -2, np.full(len(rows), np.inf, dtype), np.zeros(len(rows), np.int64)
-        for left in range(0, len(points), TILE):
-            columns = slice(left, left + TILE)
-            block = own @ points[columns].T
-            block += square[columns]
-            block += square[rows, None]
-            np.maximum(block, 0, out=block)
-            block /= inverse[rows, None] + inverse[columns]
-            inside = np.flatnonzero((rows >= left) & (rows < left + TILE))
-            block[inside, rows[inside] - left] = np.inf
-            at = block.argmin(axis=1)
-            result = block[np.arange(len(rows)), at]
-            better = result < best
-            best[better], where[better] = result[better], at[better] + left
-        nearest[rows], distance[rows] = where, best
+    at_once = max(1, NUMBERS_AT_ONCE // len(points))
+    for start in range(0, len(stale), at_once):
+        rows = stale[start : start + at_once]
+        block = points[rows] * -2 @ points.T
+        block += square
+        block += square[rows, None]
+        np.maximum(block, 0, out=block)
+        block /= inverse[rows, None] + inverse
+        block[np.arange(len(rows)), rows] = np.inf
+        nearest[rows] = block.argmin(axis=1)
+        distance[rows] = block[np.arange(len(rows)), nearest[rows]]
 
 
 def _in_order(merges: np.ndarray, count: int) -> np.ndarray:
