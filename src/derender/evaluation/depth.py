@@ -55,6 +55,9 @@ class GeometryResult(ImageResult):
     coverage = Column(
         "coverage", None, note="share of the true object that the prediction covers; errors count only there"
     )
+    titles: ClassVar[Mapping[str, str]] = {
+        "model": "model", "average_depth": "average depth", "plane": "plane", "untrained": "untrained model",
+    }  # fmt: skip
     notes: ClassVar[Mapping[str, str]] = {
         "average depth": "the mean true depth map, the same for every image",
         "untrained model": "same networks, fresh weights",
@@ -64,11 +67,6 @@ class GeometryResult(ImageResult):
     average_depth: GeometryScores
     plane: GeometryScores
     untrained: GeometryScores | None = None
-
-    def named(self) -> dict[str, GeometryScores]:
-        """Scores by row."""
-        named = {"model": self.model, "average depth": self.average_depth, "plane": self.plane}
-        return named if self.untrained is None else {**named, "untrained model": self.untrained}
 
 
 def angle_deg(a: Float[Tensor, "*n 3"], b: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:

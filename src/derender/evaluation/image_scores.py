@@ -26,17 +26,20 @@ class ImageResult:
     """A model's scores beside its controls, all on the same images.
 
     ``columns`` are of the scores, ``caption`` has a place for the number of images. ``coverage`` is the
-    column of ``coverage`` where rows have that. ``notes`` are on rows, by their name.
+    column of ``coverage`` where rows have that. ``titles`` name the rows by field, the model first, with a
+    place for the result's numbers. ``notes`` are on rows, by their name.
     """
 
     columns: ClassVar[Mapping[str, Column]]
     caption: ClassVar[str]
     coverage: ClassVar[Column | None] = None
+    titles: ClassVar[Mapping[str, str]] = {}
     notes: ClassVar[Mapping[str, str]] = {}
 
-    def named(self) -> Mapping[str, Any]:
-        """The model, then its controls, by row: objects with (N,) of each score as ``SCORE_each``."""
-        return {}
+    def named(self) -> dict[str, Any]:
+        """By row those that were scored: objects with (N,) of each score as ``SCORE_each``."""
+        scored = {title.format(self): getattr(self, field) for field, title in self.titles.items()}
+        return {title: scores for title, scores in scored.items() if scores is not None}
 
     def each(self) -> dict[str, dict[str, np.ndarray]]:
         """Every score of every image, (N,), by row."""

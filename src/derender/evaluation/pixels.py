@@ -61,6 +61,10 @@ class ReconstructionResult(ImageResult):
     }
     caption = "Reconstruction of {}"
     coverage = Column("coverage", None, note="share of all pixels inside the mask")
+    titles: ClassVar[Mapping[str, str]] = {
+        "model": "model", "mean_picture": "mean image", "components": "PCA ({0.n_components})",
+        "untrained": "untrained model",
+    }  # fmt: skip
     notes: ClassVar[Mapping[str, str]] = {
         "untrained model": "same networks, fresh weights, inside its own mask"
     }
@@ -70,14 +74,6 @@ class ReconstructionResult(ImageResult):
     components: ReconstructionScores | None = None
     untrained: ReconstructionScores | None = None
     n_components: int = 0
-
-    def named(self) -> dict[str, ReconstructionScores]:
-        """Scores by row."""
-        named = {
-            "model": self.model, "mean image": self.mean_picture,
-            f"PCA ({self.n_components})": self.components, "untrained model": self.untrained,
-        }  # fmt: skip
-        return {name: scores for name, scores in named.items() if scores is not None}
 
 
 def reconstruction_scores(
