@@ -3,7 +3,7 @@
 Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering with as many clusters as
     classes; accuracy is weighted purity. The paper's CelebA figure is the mean over 40 attributes, each
     with two clusters: one cut of one tree. A row that lacks one of several labels is clustered and does not
-    count for that label; a row without any is left out before. Controls of the images are in controls.py.
+    count for that label; a row without any is left out before.
     ``majority`` is the score of one single cluster, ``chance`` that of the first features' clusters with rows
     dealt at random.
 """
@@ -27,8 +27,13 @@ from derender.evaluation.clustering_scores import (
     encoded,
     scores_of_counts,
 )
-from derender.evaluation.controls import subject_and_controls
-from derender.evaluation.feature_rows import FeatureSource, check_lengths, chosen_labels, prepare
+from derender.evaluation.feature_rows import (
+    FeatureSource,
+    check_lengths,
+    chosen_labels,
+    prepare,
+    subject_and_controls,
+)
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, judged_tables, verdict
@@ -67,10 +72,7 @@ def cluster(
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
     mean_by = (mean_by,) if isinstance(mean_by, str) else mean_by
     ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)
-    result = compare_clusterings(
-        ready.features, ready.labels, controls=ready.controls, method=method, n_clusters=clusters,
-        resample_count=how.resamples, seed=how.seed, memory=how.memory,
-    )  # fmt: skip
+    result = compare_clusterings(**ready.asked, method=method, n_clusters=clusters, **how.scoring)
     tables = clustering_tables(result, "Above the strongest control? (paired resamples of the rows)")
     levels = {}
     if method == "finch" and len(names) == 1:

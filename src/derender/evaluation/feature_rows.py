@@ -1,8 +1,12 @@
-"""Rows of a comparison: feature tables of the same images, checked against each other, and their labels.
+"""Rows of a comparison: feature tables of the same images, checked against each other, labels and controls.
 
 A row is one kind of feature; several tables in one row are runs of the same thing (seeds). ``row_of`` makes
-one of tables and models, ``prepare`` the arrays that protocols take. Leaves out controls (controls.py) and
-scores.
+one of tables and models, ``prepare`` the arrays that protocols take. Leaves out scores.
+
+Controls are made of the same images under the same protocol, without learning: an untrained encoder of the
+same architecture (several seeds), principal components and the pixels themselves. Tables of identity and
+class also have descriptors, of the image alone and averaged with those of its mirror image: whitened features
+see both.
 """
 
 from collections import defaultdict
@@ -12,20 +16,26 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
+from pydantic import ValidationError
 
 from derender.baselines import load_baseline
+from derender.baselines.controls import control_table, descriptor_features, pca_features, pixel_features
 from derender.data import ImageSet
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import DEFAULT_FACTORS, Options
+from derender.evaluation.pixels import component_count
 from derender.features import FeatureTable, embed_images, missing, table_labels
 from derender.features.extract import model_facts
 from derender.inputs import Progress, as_model, device_named
 from derender.model import Derenderer
+from derender.presets import ModelSettings
 from derender.storage.folder import CONFIG_FILE, saved_config
 
 ModelSource = Derenderer | str | Path
 FeatureSource = FeatureTable | ModelSource
 """A table or its ``.parquet`` file; a model or its name, or a baseline's run folder."""
+UNTRAINED = "untrained encoder"
+DESCRIPTORS_SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,11 @@ class Prepared:
     table: FeatureTable
     controls: tuple[str, ...]
     n_dropped: int
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """Features, labels and controls, as comparisons take them."""
+        return {"features": self.features, "labels": self.labels, "controls": self.controls}
 
     @property
     def split(self) -> dict[str, Any]:
@@ -267,3 +282,79 @@ def check_rows(rows: Sequence[FeatureRow]) -> None:
 def _made_by(table: FeatureTable) -> list[Any]:
     sizes = {factor: values.shape[1] for factor, values in table.factors.items()}
     return [sizes, *(table.origin.get(name) for name in ("model", "settings", "control"))]
+
+
+def subject_and_controls(features: FeatureSource, options: Options) -> list[FeatureRow]:
+    """The row of one table or model, and behind it the controls of its images."""
+    return with_controls([one_row(features, options)], options)
+
+
+def with_controls(rows: Sequence[FeatureRow], options: Options) -> list[FeatureRow]:
+    """The rows, and behind them the controls of their images; without images there are none."""
+    check_rows(rows)
+    if options.images is None:
+        options.notes.append("without images there are no pixels, PCA and untrained encoder to compare with")
+        return list(rows)
+    settings = architecture(rows)
+    size = 64 if settings is None else settings.network.image_size
+    return [*rows, *control_rows(options.at(size, rows[0].tables[0].files), settings, options)]
+
+
+def control_rows(
+    images: ImageSet, settings: ModelSettings | None, options: Options, fit_on: ImageSet | None = None
+) -> list[FeatureRow]:
+    """The controls of every protocol on features: an untrained encoder, PCA and pixels.
+
+    Without ``settings``, an architecture, there is no untrained encoder. PCA gets its components from
+    ``fit_on``, by default ``images``.
+    """
+    rows, tables = [], []
+    if settings is not None:
+        for seed in options.seeds(options.untrained_seeds):
+            encoder = Derenderer.seeded(settings, seed).to(device_named(options.device)).eval()
+            table = embedded_table(encoder, images, options.memory, options.stage(f"{UNTRAINED} {seed}"))
+            tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
+        rows.append(FeatureRow(UNTRAINED, tuple(tables), options.chosen, control=True))
+    fitted = images if fit_on is None else fit_on
+    components = component_count(len(fitted))  # whitening needs many more rows than components
+    inputs = {"images": images.images, "components": components}
+    inputs |= {} if fit_on is None else {"fit_on": fit_on.images}
+    pca = options.memory.recall_one(
+        "pca", inputs, lambda: pca_features(images, components=components, fit_on=fitted).factors["pca"]
+    )
+    table = control_table(images, "pca", pca, {"components": components})
+    rows.append(FeatureRow(f"PCA ({components})", (table,), control=True))
+    options.notes.append(
+        f"PCA ({components}), whitened, is fitted to {len(fitted):,} images of {fitted.source}"
+    )
+    rows.append(FeatureRow("pixels", (pixel_features(images),), control=True))
+    for name, shown in DESCRIPTORS_SHOWN.items() if options.descriptors else ():
+        try:
+            table = descriptor_features(name, images, progress=options.stage(name))
+            mirrored = replace(images, images=np.ascontiguousarray(images.images[..., ::-1]))
+            other = descriptor_features(name, mirrored, progress=options.stage(f"{name} of mirror images"))
+        except ValueError as error:  # a package is missing, or images are smaller than a cell
+            options.notes.append(f"{name} left out: {error}")
+        else:
+            both = replace(table, factors={name: (table.factors[name] + other.factors[name]) / 2})
+            rows.append(FeatureRow(shown, (table,), control=True))
+            rows.append(FeatureRow(f"{shown} with mirror image", (both,), control=True))
+    return rows
+
+
+def architecture(rows: Sequence[FeatureRow]) -> ModelSettings | None:
+    """The model settings of the first row that a ``Derenderer`` made; None if there is none."""
+    for row in rows:
+        origin = row.tables[0].origin
+        own = origin.get("model", Derenderer.__name__) == Derenderer.__name__
+        stored = origin.get("settings") if own else None
+        if stored is not None and not row.control:
+            try:
+                return ModelSettings.model_validate(stored)
+            except ValidationError as error:
+                first = error.errors()[0]
+                raise ValueError(
+                    f"features {row.name!r} were made by a model this version does not know "
+                    f"({'.'.join(map(str, first['loc']))}: {first['msg']}): embed the data again"
+                ) from error
+    return None

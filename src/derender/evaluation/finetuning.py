@@ -27,8 +27,7 @@ from derender.baselines.controls import untrained_twin
 from derender.baselines.supervised import drawn_labelled
 from derender.data import ImageSet, Split, split_indices
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, numbers_of, with_verdicts
-from derender.evaluation.controls import UNTRAINED, control_rows
-from derender.evaluation.feature_rows import embedded_table
+from derender.evaluation.feature_rows import UNTRAINED, control_rows, embedded_table
 from derender.evaluation.linear_probes import head_loss, probabilities
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task, task_of

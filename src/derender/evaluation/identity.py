@@ -15,8 +15,7 @@ import numpy as np
 from derender.data.layouts.layout import in_test_half, stem_of
 from derender.evaluation import bootstrap
 from derender.evaluation.clustering import compare_clusterings
-from derender.evaluation.controls import subject_and_controls
-from derender.evaluation.feature_rows import FeatureSource, is_model, prepare
+from derender.evaluation.feature_rows import FeatureSource, is_model, prepare, subject_and_controls
 from derender.evaluation.image_scores import LIGHT_BINS_DEG, binned_rows
 from derender.evaluation.neighbours import unit_rows
 from derender.evaluation.options import Options
@@ -81,10 +80,9 @@ def identify(
     )  # fmt: skip
     near = known & (angle <= cluster_within) if angle is not None else np.zeros(len(who), bool)
     if len(set(who[near])) > 1 and len(set(who[near])) < near.sum():
-        result = compare_clusterings(
-            {name: [run[near] for run in runs] for name, runs in ready.features.items()}, {label: who[near]},
-            controls=ready.controls, resample_count=how.resamples, seed=how.seed, memory=how.memory,
-        ).rows  # fmt: skip
+        codes = {name: [run[near] for run in runs] for name, runs in ready.features.items()}
+        own = {"features": codes, "labels": {label: who[near]}, "controls": ready.controls}
+        result = compare_clusterings(**own, **how.scoring).rows
         ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in result}
         both = [replace(row, scores={**row.scores, **ward[row.name]}) for row in scored]
         scored = bootstrap.with_verdicts(both)
@@ -211,21 +209,20 @@ def verify(
     names = {*pairs.first, *pairs.second}
     if is_model(features):
         features = as_model(features, device=how.device)
-        files = how.at(features.image_size).files
+        known = how.at(features.image_size)
     else:
-        features = features if isinstance(features, FeatureTable) else FeatureTable.read(str(features))
-        files = features.files
-    stems = list(map(stem_of, files))
+        known = features if isinstance(features, FeatureTable) else FeatureTable.read(str(features))
+    stems = list(map(stem_of, known.files))
     if absent := sorted(names.difference(stems)):
         raise ValueError(
             f"{len(absent):,} of {len(names):,} images of the pairs are not there (first {absent[0]}): give "
             "the images that the pairs were drawn from"
         )
-    chosen = np.array([stem in names for stem in stems])
-    if isinstance(features, FeatureTable):
-        features = features.select(chosen)
+    chosen = known.select(np.array([stem in names for stem in stems]))
+    if isinstance(chosen, FeatureTable):
+        features = chosen
     else:
-        how = replace(how, images=how.at(features.image_size).select(chosen))
+        how = replace(how, images=chosen)
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])

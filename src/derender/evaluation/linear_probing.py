@@ -31,7 +31,6 @@ from derender.baselines.supervised import fresh_resnet18
 from derender.data import as_float
 from derender.evaluation import bootstrap, feature_rows
 from derender.evaluation import linear_probes as probes
-from derender.evaluation.controls import UNTRAINED, subject_and_controls
 from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, mean_precision, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
@@ -93,7 +92,7 @@ def linear(
     if finetune and not feature_rows.is_model(features):
         raise ValueError("finetune trains the encoders: give a model and images")
     how = Options(untrained_seeds=untrained_seeds, **options)
-    rows = subject_and_controls(features, how)
+    rows = feature_rows.subject_and_controls(features, how)
     names, left_out = feature_rows.chosen_labels(rows[0].tables[0], label, attributes, least=2)
     ready = feature_rows.prepare(rows, names, min_count=min_count, max_count=max_count)
     result = compare_prepared(
@@ -179,7 +178,7 @@ def compare_prepared(
     opened = partial(feature_rows.opened, device=options.device)
     trained = {name: list(map(opened, runs)) for name, runs in (models or {}).items()}
     if ours := [run for runs in trained.values() for run in runs if isinstance(run, Derenderer)]:
-        trained[UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
+        trained[feature_rows.UNTRAINED] = [untrained_twin(ours[0], seed) for seed in seeds]
     if supervised:
         size, device = next(iter(trained.values()))[0].image_size, device_named(options.device)
         trained[SUPERVISED] = [fresh_resnet18(size, seed).to(device) for seed in seeds]
@@ -190,7 +189,7 @@ def compare_prepared(
             tuned[name][count] = np.stack(each)
     again: dict[str, Any] = {"settings": settings, "memory": options.memory}
     for name in ready.controls if models else ():
-        if not name.startswith(UNTRAINED):  # no encoder to train: the answers of the head alone
+        if not name.startswith(feature_rows.UNTRAINED):  # no encoder to train: the answers of the head alone
             alone = partial(probes.probe_runs, "linear", ready.features[name], task, **again)
             tuned[name] = {count: alone(own, split.test, seeds) for count, own in split.train.items()}
     return compare_linear(

@@ -65,6 +65,11 @@ class Options:
         factors = (self.factors,) if isinstance(self.factors, str) else self.factors
         return None if factors is None else tuple(factors)
 
+    @property
+    def scoring(self) -> dict[str, Any]:
+        """Keywords of comparisons on arrays: resamples, their seed and the cache."""
+        return {"resample_count": self.resamples, "seed": self.seed, "memory": self.memory}
+
     def seeds(self, count: int) -> tuple[int, ...]:
         """So many seeds, from ``seed`` on."""
         return tuple(range(self.seed, self.seed + count))

@@ -13,8 +13,15 @@ from derender.data import ImageSet
 from derender.evaluation.clustering import clustering_tables, compare_clusterings
 from derender.evaluation.clustering_methods import METHODS
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
-from derender.evaluation.controls import with_controls
-from derender.evaluation.feature_rows import FeatureSource, chosen_labels, is_model, prepare, row_of, runs_of
+from derender.evaluation.feature_rows import (
+    FeatureSource,
+    chosen_labels,
+    is_model,
+    prepare,
+    row_of,
+    runs_of,
+    with_controls,
+)
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
@@ -119,15 +126,14 @@ def compare(
         beside = f"beside the paper's Table {spec.number}"
         more: dict[str, Any] = {"paper": part.paper}
         if spec.kind == "cluster":
-            asked = (ready.features, ready.labels)
-            again = {"controls": ready.controls, "resample_count": how.resamples, "seed": how.seed}
-            result = compare_clusterings(*asked, method=method, memory=how.memory, **again)
+            same = {**ready.asked, **how.scoring}
+            result = compare_clusterings(method=method, **same)
             more |= {"n_dropped_before": ready.n_dropped, "differs": part.differs(layout, result.n_rows)}
             shown = {name: CLUSTER_COLUMNS[name] for name in ("accuracy", "f1")}
             scored = {row.name: row for row in result.rows}
             if method == "ward":  # the paper's appendix has FINCH beside it
                 try:
-                    finch = compare_clusterings(*asked, method="finch", memory=how.memory, **again)
+                    finch = compare_clusterings(method="finch", **same)
                 except ValueError as error:  # its finest partition has fewer clusters than there are classes
                     notes.append(f"{part.name}: FINCH left out: {error}")
                 else:

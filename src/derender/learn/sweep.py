@@ -26,8 +26,13 @@ from derender.data import ImageSet
 from derender.data.source import stamps_of
 from derender.evaluation.clustering import clustering_tables, compare_clusterings
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
-from derender.evaluation.controls import architecture, control_rows
-from derender.evaluation.feature_rows import FeatureRow, chosen_labels, prepare
+from derender.evaluation.feature_rows import (
+    FeatureRow,
+    architecture,
+    chosen_labels,
+    control_rows,
+    prepare,
+)
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_prepared, linear_tables
 from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options, aligned
@@ -217,10 +222,7 @@ class Sweep:
             ready = prepare(rows, columns, **rules)
             for protocol in scored.protocols:
                 if protocol == "cluster":
-                    result = compare_clusterings(
-                        ready.features, ready.labels, controls=ready.controls, method=plan.clustering,
-                        resample_count=plan.resamples, memory=how.memory,
-                    )  # fmt: skip
+                    result = compare_clusterings(**ready.asked, method=plan.clustering, **how.scoring)
                     own = clustering_tables(result, "above the strongest control?")
                 else:
                     result = compare_prepared(ready, plan.counts, how.seeds(plan.draws), how)

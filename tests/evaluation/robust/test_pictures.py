@@ -11,8 +11,8 @@ from derender import Derenderer
 from derender.data import ImageSet
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust.sources import Recipe, generated_trial, rendered_trial, true_angle_trial
-from derender.evaluation.robust.trial import checked_levels, chosen_axes
+from derender.evaluation.robust import trial as trials
+from derender.evaluation.robust.trial import Recipe, chosen_axes
 from derender.render import render_scene
 
 YAW, LIGHT = chosen_axes(["yaw", "light"])
@@ -38,12 +38,12 @@ def test_generated_faces_stay_the_same_while_one_angle_is_held():
 
 def test_a_generated_trial_is_made_once(tmp_path):
     recipe = Recipe(people=3, learned=3, tested=2, image_size=16)
-    trial = generated_trial(recipe, (YAW, LIGHT), (0, 30), memory=Memory(tmp_path))
+    trial = trials.generated_trial(recipe, (YAW, LIGHT), (0, 30), memory=Memory(tmp_path))
     yaw, light = trial.curves
     assert len(trial.images) == 9 + 6 + 2 * (6 + 12)  # 30 degrees to either side
     assert [len(rows) for rows in (*yaw.points, *light.points[1:])] == [6, 6, 12, 6, 12]
     memory = Memory(tmp_path)
-    again = generated_trial(replace(recipe), (YAW, LIGHT), (0, 30), memory=memory)
+    again = trials.generated_trial(replace(recipe), (YAW, LIGHT), (0, 30), memory=memory)
     assert memory.recalled == 1 and np.array_equal(again.images, trial.images)
     expected = recipe.generate("tested", axis=LIGHT, angle=30.0)
     assert np.array_equal(trial.images[light.points[2][6:]], expected.images)
@@ -55,7 +55,7 @@ def test_a_generated_trial_is_made_once(tmp_path):
 
 def test_nobody_is_asked_what_nobody_could_learn():
     recipe = Recipe("cars", "class", people=16, learned=1, tested=1, image_size=16)
-    trial = generated_trial(recipe, [LIGHT], (0, 20))
+    trial = trials.generated_trial(recipe, [LIGHT], (0, 20))
     (curve,) = trial.curves
     counted = np.bincount(trial.task.targets[curve.learn].argmax(1), minlength=len(trial.task.names))
     asked = trial.task.targets[np.concatenate(curve.points)].argmax(1)
@@ -75,7 +75,7 @@ def test_a_rendered_trial_changes_the_angle_alone():
     pictures = ImageSet(images, tuple("abcdefgh"))
     task = task_of({"who": np.array(list("xyxyxyxy"))})
     learn, test = np.arange(6), np.array([6, 7])
-    trial = rendered_trial(model, pictures, task, learn, test, (YAW, LIGHT), (0, 40))
+    trial = trials.rendered_trial(model, pictures, task, learn, test, (YAW, LIGHT), (0, 40))
     plain, *turned = scenes
     assert len(trial.images) == 8 + 2 * (2 + 4) and trial.curves[0].learn.tolist() == [0, 1, 2, 3, 4, 5]
     with torch.inference_mode():
@@ -90,7 +90,7 @@ def test_a_rendered_trial_changes_the_angle_alone():
         assert torch.allclose(turned[at].camera, own.camera)
     assert trial.task.targets[trial.curves[1].points[2]].ravel().tolist() == [0, 1, 0, 1]
     groups = np.array(["a", "a", "b", "b", "", "", "", "c"])  # the fifth is learned from, the seventh tested
-    apart = rendered_trial(model, pictures, task, learn, test, (YAW,), (0, 40), groups=groups)
+    apart = trials.rendered_trial(model, pictures, task, learn, test, (YAW,), (0, 40), groups=groups)
     assert apart.unit[0] == apart.unit[1] != apart.unit[2] and len(set(apart.unit[:8].tolist())) == 6
 
 
@@ -101,7 +101,7 @@ def test_true_angles_divide_tracks():
     labels = {"track": track.astype(str), "camera_y_rad": angle}
     pictures = ImageSet(np.zeros((32, 3, 4, 4), np.uint8), tuple(map(str, range(32))), labels)
     task = task_of({"who": np.array(list("ab"))[track // 2 % 2]})
-    trial = true_angle_trial(pictures, task, [YAW], portions=2)
+    trial = trials.true_angle_trial(pictures, task, [YAW], portions=2)
     (curve,) = trial.curves
     turn = np.degrees(np.abs(angle))
     assert turn[curve.learn].max() < min(turn[rows].min() for rows in curve.points[2:])
@@ -109,10 +109,10 @@ def test_true_angles_divide_tracks():
     assert curve.levels[1] == pytest.approx(turn[curve.points[2]].mean())
     assert np.array_equal(*curve.points[:2])
     with pytest.raises(ValueError, match="there is no 'light_yaw_rad'"):
-        true_angle_trial(pictures, task, [LIGHT])
+        trials.true_angle_trial(pictures, task, [LIGHT])
     still = ImageSet(pictures.images, pictures.files, {**labels, "camera_y_rad": np.zeros(32)})
     with pytest.raises(ValueError, match="all at one angle"):
-        true_angle_trial(still, task, [YAW])
+        trials.true_angle_trial(still, task, [YAW])
 
 
 def test_bad_words_are_refused():
@@ -121,9 +121,9 @@ def test_bad_words_are_refused():
     with pytest.raises(ValueError, match="generated cars cannot be rotated about the axis 'pitch'"):
         chosen_axes(["pitch"], "cars")
     with pytest.raises(ValueError, match="two or more that grow"):
-        checked_levels((30, 0), [YAW])
+        trials.checked_levels((30, 0), [YAW])
     few = Recipe(people=2, learned=1, tested=1, image_size=16)
     with pytest.raises(ValueError, match="label of generated faces 'expresion'; did you mean 'expression'"):
-        generated_trial(replace(few, label="expresion"), [YAW], (0, 9))
+        trials.generated_trial(replace(few, label="expresion"), [YAW], (0, 9))
     with pytest.raises(ValueError, match="fewer than two values of 'identity' have two images"):
-        generated_trial(few, [YAW], (0, 9))
+        trials.generated_trial(few, [YAW], (0, 9))

@@ -1,7 +1,6 @@
 """Does a probe's answer hold under other light and from other sides? Curves over angles, and their area.
 
-trial     axes of light and camera; training images, and test images at each angle
-sources   trials of generated images, of images re-rendered by a model, and of images with known angles
+trial     axes of light and camera; training images, and test images at each angle, and where they come from
 compare   probes, curves, intervals, controls: ``robustness``
 """
 

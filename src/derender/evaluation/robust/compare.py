@@ -16,13 +16,12 @@ from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
 from derender.evaluation import bootstrap, feature_rows
-from derender.evaluation.controls import control_rows
 from derender.evaluation.linear_probes import PROBES, majority_answers, probe_runs
 from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.robust import sources
-from derender.evaluation.robust.trial import LEVELS, Curve, Trial, checked_levels, chosen_axes
+from derender.evaluation.robust import trial as trials
+from derender.evaluation.robust.trial import LEVELS, Curve, Trial
 from derender.evaluation.score_table import (
     Column,
     Row,
@@ -35,7 +34,7 @@ from derender.evaluation.score_table import (
 from derender.features import FeatureTable, named, table_labels
 from derender.inputs import Progress, as_model
 
-WAYS = (*sources.KINDS, "render", "truth")
+WAYS = (*trials.LABELS, "render", "truth")
 SCORES = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
 """By score, its name in tables and charts."""
 LEARNED_SHARE = 0.8
@@ -93,21 +92,21 @@ def robustness(
     named(dict.fromkeys(WAYS), way, "kind of images")
     named(SCORES, score, "score")
     named(PROBES, head, "head")
-    generated, names = way in sources.KINDS, [label] if isinstance(label, str) else list(label or ())
+    generated, names = way in trials.LABELS, [label] if isinstance(label, str) else list(label or ())
     if generated == (images is not None):
         what = "are generated and take no images" if generated else "need images"
         raise ValueError(f"images {way!r} {what}")
     if generated and (attributes or groups or len(names) > 1):
         raise ValueError(f"images {way!r} are asked one label; attributes and groups need images")
-    turned = chosen_axes(axes, way if generated else None)
-    levels = checked_levels(angles, turned)
+    turned = trials.chosen_axes(axes, way if generated else None)
+    levels = trials.checked_levels(angles, turned)
     given = models if isinstance(models, Mapping) else {"model": models}
     nets = {name: as_model(one, device=how.device) for name, one in given.items()}
     first = next(iter(nets.values()))
     if generated:
-        name = names[0] if names else sources.KINDS[way].label
-        recipe = sources.Recipe(way, name, people, learned, tested, first.image_size, how.seed)
-        trial = sources.generated_trial(
+        name = names[0] if names else trials.LABELS[way]
+        recipe = trials.Recipe(way, name, people, learned, tested, first.image_size, how.seed)
+        trial = trials.generated_trial(
             recipe, turned, levels, memory=how.memory, progress=how.stage("generating")
         )
     else:
@@ -122,11 +121,11 @@ def robustness(
         side = ready.table.label(groups) if groups else None
         read, task = how.at(first.image_size, ready.table.files), task_of(ready.labels)
         if way == "truth":
-            trial = sources.true_angle_trial(read, task, turned)
+            trial = trials.true_angle_trial(read, task, turned)
         else:
             parts = divide_rows(task, **ready.split, test_fraction=test_fraction, groups=side)
             progress = how.stage("re-rendering")
-            trial = sources.rendered_trial(
+            trial = trials.rendered_trial(
                 first, read, task, *parts, turned, levels, groups=side, memory=how.memory, progress=progress
             )
     rows = []
@@ -139,11 +138,11 @@ def robustness(
             rows += [feature_rows.FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
     learned_from = np.unique(np.concatenate([curve.learn for curve in trial.curves]))
     fit_on = trial.pictures.select(learned_from)
-    rows += control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
+    rows += feature_rows.control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
     result = compare_robustness(
         {row.name: row.arrays() for row in rows}, trial, how.seeds(seeds),
-        controls=[row.name for row in rows if row.control], head=head, resample_count=how.resamples,
-        seed=how.seed, memory=how.memory, progress=how.stage("probing", "probes"),
+        controls=[row.name for row in rows if row.control], head=head, **how.scoring,
+        progress=how.stage("probing", "probes"),
     )  # fmt: skip
     notes = [*how.notes, f"{len(trial.images):,} images: {trial.how}"]
     notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA)}" for curve in result.curves]
