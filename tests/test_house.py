@@ -17,7 +17,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (7_445, 32),
-    "evaluation": (7_465, 38),  # public functions name their errors
+    "evaluation": (7_425, 36),  # public functions name their errors
     "report": (4_045, 25),
     "cli": (2_315, 32),  # pack refuses options without effect
     "training": (3_560, 17),  # CUDA graphs
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_700, 248)  # on the way to (37_000, 270)
+TOTAL = (39_660, 246)  # on the way to (37_000, 270)
 TEST_LINES = 25_880
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
