@@ -64,8 +64,8 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
 @pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [
-        ("faces", ["--light", "noon"], "light must be one of usual, wide, frontal, got 'noon'"),
-        ("faces", ["--view", "above"], "view must be one of usual, wide, frontal"),
+        ("faces", ["--light", "noon"], "unknown light 'noon': choose usual, wide or frontal"),
+        ("faces", ["--view", "above"], "unknown view 'above': choose usual, wide or frontal"),
         ("faces", ["--set", "light.colour=red"], "?: there are light.yaw_deg, light.pitch_deg"),
         ("faces", ["--set", "light.yaw_deg"], "write key=value"),
         ("faces", ["--set", "light.yaw_deg=[-60,99]"], "setting 'light.yaw_deg': must be two numbers"),
@@ -76,7 +76,7 @@ def test_a_folder_of_cars_holds_what_was_requested(car_folder):
         ("faces", ["--benchmark", "--identities", "5"], "--benchmark has settings of its own"),
         ("cars", ["--benchmark", "--classes", "jeep"], "--benchmark has settings of its own"),
         ("cars", ["--classes", "tank"], "'classes': must be one or more of sedan"),
-        ("cars", ["--view", "side"], "view must be one of usual, wide, frontal"),
+        ("cars", ["--view", "side"], "choose usual, wide or frontal"),
         ("cars", ["--set", "view.azimuth_deg=[50,10]"], "view.azimuth_deg"),
         ("cars", ["--set", "doors=3"], "unknown setting 'doors'"),
     ],

@@ -233,6 +233,7 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
     part, total = np.empty(_ALL, np.int32), np.empty(3, np.float32)
     plain, lamp, result, air = is_plain(light), light.lamps[0], np.ones(4, np.float32), light.haze[1]
     result[2] = _ZERO
+    depth, cosine, normal = _ONE, _ZERO, (_ZERO, _ZERO, _ZERO)
     span, veil = depths_seen(nearest), np.exp(-light.haze[0])  # of what is farthest, and of the background
     for pixel in range(np.uint32(side * side)):
         i, j, seen = pixel // side, pixel % side, 0

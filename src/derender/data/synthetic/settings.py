@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from derender.overrides import with_changes
 from derender.settings import Settings
+from derender.storage.places import require_known
 
 Kind = TypeVar("Kind", bound=Settings)
 Range = tuple[float, float]
@@ -263,7 +264,6 @@ def named_settings(
     """
     lights, views = (LIGHTS, VIEWS) if kind is FaceSettings else (CAR_LIGHTS, CAR_VIEWS)
     for option, name, known in (("light", light, lights), ("view", view, views)):
-        if name not in known:
-            raise ValueError(f"{option} must be one of {', '.join(known)}, got {name!r}")
+        require_known(option, name, tuple(known))
     chosen = kind.model_validate(own | {"light": lights[light], "view": views[view]})
     return with_changes(chosen, overrides)
