@@ -22,7 +22,7 @@ DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "ben
 
 # A module imports only from its own stage or from stages to its left.
 STAGES = [
-    *("settings", "storage", "scene", "render", "data", "networks", "renderers", "objectives"),
+    *("settings", "storage", "overrides", "scene", "render", "data", "networks", "renderers", "objectives"),
     *("presets", "postprocess", "model", "training", "inputs", "photo", "features", "baselines"),
     *("evaluation", "speed", "interpretation", "report", "learn", "demo", "cli", "__main__"),
 ]

@@ -53,13 +53,15 @@ def visible(text: str, kept: str = "\n") -> str:
     return "".join(char if char in kept or char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def report_images(images: "ImageSet") -> None:
+def report_images(
+    images: "ImageSet", word: str = "skipped", rest: str = "(derender doctor --json FILE names all)"
+) -> None:
     """What was read, and the first of what was left out by name."""
     notice(images.describe())
     for row in images.skipped[:NAMED]:
-        notice(f"skipped {visible(row.file, '')}: {row.reason}")
-    if len(images.skipped) > NAMED:
-        notice(f"and {len(images.skipped) - NAMED:,} more (derender doctor --json FILE names all)")
+        notice(f"{word} {visible(row.file, '')}: {row.reason}")
+    if (more := len(images.skipped) - NAMED) > 0:
+        notice(f"and {more:,} more {rest}")
 
 
 @contextmanager

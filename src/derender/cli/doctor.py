@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file
+from derender.cli.console import notice, progress_bar, refuse_existing_file, report_images
 from derender.cli.options import DataOptions, Output, Seed, command, option
 
 WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}  # worst first
@@ -28,11 +28,7 @@ def doctor(
 
     with progress_bar("examining") as report:
         result = examine(image_set.address, **image_set.how, seed=seed, progress=report)
-    notice(result.images.describe())
-    for row in result.images.skipped[:NAMED]:
-        notice(f"unreadable: {row.file}: {row.reason}")
-    if (more := len(result.images.skipped) - NAMED) > 0:
-        notice(f"and {more:,} more unreadable files (--json names all)")
+    report_images(result.images, "unreadable:", "unreadable files (--json names all)")
     for finding in sorted(result.findings, key=lambda one: list(WORDS).index(one.level)):
         advice = f" {finding.advice}" if finding.advice else ""
         output.result(f"{WORDS[finding.level]:>4}  {finding.name}: {finding.text}{advice}")

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from derender.data.source import evenly_spaced
 from derender.storage.atomic import atomic_file
 
 _MARK = b"derender pictures 2\n"
@@ -108,9 +109,8 @@ def write_cache(
 
 
 def sample_checksum(rows: np.ndarray) -> int:
-    """CRC of at most 64 rows, evenly spaced, the first and the last among them."""
-    chosen = np.unique(np.linspace(0, len(rows) - 1, 64).astype(int)) if len(rows) else []
+    """CRC of at most 64 rows."""
     checksum = 0
-    for row in chosen:
+    for row in evenly_spaced(len(rows), 64):
         checksum = zlib.crc32(rows[row].tobytes(), checksum)
     return checksum

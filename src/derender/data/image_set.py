@@ -28,7 +28,7 @@ from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
 from derender.data.source import Skipped
 from derender.data.stream import Decoded, Kinds, Progress, Stream, Value, column_of, decoded, estimated_total
-from derender.storage.places import require_known, suggestion
+from derender.storage.places import counted, require_known, suggestion
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,7 @@ class ImageSet:
 
     def describe(self) -> str:
         """One line: how many images, of which layout, what was left out."""
-        noun = "image" if len(self) == 1 else "images"
-        parts = [f"{len(self):,} {noun} from {self.source} ({self.layout})"]
+        parts = [f"{counted(len(self), 'images')} from {self.source} ({self.layout})"]
         if self.skipped:
             parts.append(f"{len(self.skipped):,} skipped")
         if self.duplicates:

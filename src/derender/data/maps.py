@@ -26,8 +26,8 @@ from derender.data.layouts import layout_named
 from derender.data.layouts.celeba import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
-from derender.data.opening import evenly_spaced, list_images, open_source, parse_source
-from derender.data.source import Source
+from derender.data.opening import list_images, open_source, parse_source
+from derender.data.source import Source, evenly_spaced
 from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
 

@@ -39,6 +39,7 @@ from derender.data.source import (
     FolderSource,
     Skipped,
     Source,
+    evenly_spaced,
     is_hidden,
     is_image,
 )
@@ -226,11 +227,6 @@ def list_images(
     if limit is not None and limit < len(table.files):
         table = table.select(evenly_spaced(len(table.files), limit))
     return ListedStream(files, layout, table, subset, half)
-
-
-def evenly_spaced(count: int, limit: int | None) -> np.ndarray:
-    """Rows of a list of ``count``: all, or as many as ``limit``, the first and the last among them."""
-    return np.linspace(0, count - 1, count if limit is None else min(count, limit)).astype(int)
 
 
 def open_source(path: Path) -> Source:

@@ -166,6 +166,11 @@ def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:
     return np.array([(one.st_size, one.st_mtime_ns) for one in results], np.int64).reshape(-1, 2)
 
 
+def evenly_spaced(count: int, limit: int | None) -> Int64[np.ndarray, " k"]:
+    """Rows of a list of ``count``: all, or as many as ``limit``, the first and the last among them."""
+    return np.linspace(0, count - 1, count if limit is None else min(count, limit)).astype(int)
+
+
 def is_image(file: str) -> bool:
     """Whether the name has an image's suffix."""
     return file.lower().endswith(SUFFIXES)

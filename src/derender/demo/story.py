@@ -18,7 +18,7 @@ from pydantic import Field
 from derender import evaluation
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_images
-from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, faces
+from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, faces, require_empty
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import ScoreTable
 from derender.features import embed_image_set
@@ -59,8 +59,7 @@ class LivePage:
     """The page of a running demo in a new folder: the opening, progress, the newest samples; it reloads."""
 
     def __init__(self, out: Path, images: str | Path | None, side: int, report: Report):
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise FileExistsError(f"{out} exists and is not empty: choose another --out")
+        require_empty(out)
         report("editing photographs", 0, 1, "")
         self.file, self.samples = out / "report.html", out / "run" / "samples"
         self.opening = opening(images, side)

@@ -32,7 +32,7 @@ from derender.features.extract import check_size, embed_image_set, model_facts, 
 from derender.features.parquet import write_tables
 from derender.features.table import FeatureTable
 from derender.inputs import Progress, as_images, as_model
-from derender.storage.places import model_folder, require_known
+from derender.storage.places import counted, model_folder, require_known
 from derender.training.held_out_errors import read_errors, reconstruction_percentile, unlike
 
 PART_ROWS = 4096
@@ -67,8 +67,7 @@ class Embedded:
 
     def describe(self) -> str:
         """One line: how many images of which data set, how many were left out or had been there."""
-        images = "image" if self.rows == 1 else "images"
-        parts = [f"{self.rows:,} {images} from {self.source} ({self.layout})"]
+        parts = [f"{counted(self.rows, 'images')} from {self.source} ({self.layout})"]
         parts += [f"{self.resumed:,} of them from the run before"] if self.resumed else []
         parts += [f"{self.skipped:,} skipped"] if self.skipped else []
         verb = "kept" if self.kept else "dropped"

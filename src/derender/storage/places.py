@@ -11,8 +11,6 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from derender.storage import hub
-
 WEIGHTS_FILE, CONFIG_FILE = "model.safetensors", "config.json"
 # A model may lack any of these; training/held_out_errors.py writes and reads the third.
 WHITENING_FILE, FITTING_FILE = "whitening.safetensors", "fitting.safetensors"
@@ -79,11 +77,28 @@ def model_folder(source: str | Path) -> Path:
     if source in bundled_models():
         return PRETRAINED / source
     if hub_id(str(source)):
-        return hub.download(str(source), (CONFIG_FILE, *TENSOR_FILES, *TEXT_FILES))
+        return downloaded(str(source), (CONFIG_FILE, *TENSOR_FILES, *TEXT_FILES))
     raise FileNotFoundError(
         f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
         f"that come with derender ({', '.join(bundled_models())})"
     )
+
+
+def downloaded(repository: str, names: Sequence[str]) -> Path:
+    """Those of the named files that a repository has, downloaded and cached; gives their folder.
+
+    A FileNotFoundError: the Hub gave nothing under that id, or cannot be reached and nothing is cached.
+    """
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+    try:
+        return Path(snapshot_download(repository, allow_patterns=list(names)))
+    except (HfHubHTTPError, HFValidationError, OSError) as error:
+        raise FileNotFoundError(
+            f"no folder {repository} here, and the Hub gave nothing under that id ({type(error).__name__}): "
+            "check the path or the id, and the network"
+        ) from error
 
 
 def hub_id(name: str) -> bool:

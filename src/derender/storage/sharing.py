@@ -16,7 +16,6 @@ from typing import Any
 from torch import Tensor
 
 from derender.storage import folder as files
-from derender.storage import hub
 from derender.storage.atomic import new_folder
 from derender.storage.bounded import parse_json, read_bounded
 from derender.storage.folder import HeldOutErrors, texts_beside
@@ -82,7 +81,7 @@ class Shareable:
         card = card or self._card(beside, repository, data, licence, scores)
         with TemporaryDirectory() as place:
             folder = self.save_pretrained(Path(place) / "model", card=card, licence=licence)
-            return hub.upload(folder, repository, private=private, token=token)
+            return upload(folder, repository, private=private, token=token)
 
     def _card(self, beside: Mapping[str, str], title: str, *stated: str | None) -> str:
         """The card that lies beside the weights, unless data, licence or scores are stated."""
@@ -98,6 +97,34 @@ class Shareable:
             *(f"**{name}**: {text or 'not stated'}" for name, text in parts.items()),
         ]
         return "\n\n".join(paragraphs) + "\n"
+
+
+def upload(folder: Path, repository: str, *, private: bool, token: str | None) -> str:
+    """Put a folder's files into a repository, which is made where there is none; gives its address.
+
+    A ValueError: that is no name; a PermissionError: the Hub refuses; a ConnectionError: it cannot be
+    reached.
+    """
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalTokenNotFoundError
+
+    hub = HfApi(token=token)
+    try:
+        made = hub.create_repo(repository, private=private, exist_ok=True)
+        hub.upload_folder(repo_id=made.repo_id, folder_path=folder, commit_message="A derender model")
+    except HFValidationError as error:
+        raise ValueError(f"{repository!r} is no name on the Hub: give OWNER/NAME") from error
+    except (HfHubHTTPError, LocalTokenNotFoundError) as error:
+        raise PermissionError(
+            f"the Hub refuses {repository} ({' '.join(str(error).split())}): log in with 'hf auth login' or "
+            "pass token=, with the right to write there"
+        ) from error
+    except Exception as error:  # what a broken connection raises changes with the client's HTTP library
+        raise ConnectionError(
+            f"the Hub cannot be reached ({type(error).__name__}: {error}); nothing is lost: "
+            "model.save_pretrained writes the same files to a folder"
+        ) from error
+    return str(made)
 
 
 def with_metadata(card: str, licence: str | None = None) -> str:

@@ -7,26 +7,22 @@ Source: the paper, Sec. 4 and its published settings. Where the two differ the s
 import json
 import math
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from functools import reduce
-from operator import getitem
-from reprlib import Repr
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from derender.data import suggestion
 from derender.model import load
 from derender.networks import Factor
 from derender.networks.factors import GEOMETRY_START
+from derender.overrides import SHORT, checked, settings_by_name, with_changes
 from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
 from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
-from derender.storage.bounded import parse_yaml
 
 
 def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
@@ -193,12 +189,6 @@ class FinetuneConfig(TrainConfig):
 REMOVED: dict[str, Any] = {"objective.loocc_after": 0.0, "whitening.frames": 0, "whitening.reframe": ...}
 """Settings of earlier versions: runs that have them at this value (...: at any) still load."""
 
-Config = TypeVar("Config", bound=Settings)
-
-_SHORT = Repr()
-_SHORT.maxstring = _SHORT.maxother = 200  # a few lines of YAML can stand for gigabytes of text
-
-
 _PRESET_CHANGES: dict[str, dict[str, Any]] = {
     "paper": {
         "objective": {
@@ -235,12 +225,10 @@ PRESETS: dict[str, TrainConfig] = {
 
 
 def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> TrainConfig:
-    """The configuration of a run: a preset, then ``key=value`` overrides, then explicit dotted keys.
+    """The configuration of a run: a preset, then changes as ``derender.overrides.with_changes`` makes them.
 
-    Keys are dotted (``optimiser.learning_rate``); a unique last part may stand alone. Values are read as
-    YAML. In ``explicit`` dots are written as double underscores and None means not given. With ``start_from``
-    the model has that model's settings (without a U-Net decoder) instead of the preset's, before overrides
-    change them. A larger ``image_size`` than its own makes it grow (``maps_only``).
+    With ``start_from`` the model has that model's settings (without a U-Net decoder) instead of the preset's,
+    before overrides change them. A larger ``image_size`` than its own makes it grow (``maps_only``).
 
     Raises:
         ValueError: unknown preset, renderer, factor or key (names the nearest), or a value that does not fit.
@@ -266,32 +254,9 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
     return config
 
 
-def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any) -> Config:
-    """The same kind of configuration with changes as in ``resolve``."""
-    tree = config.model_dump(mode="json")
-    names, changes = settings_by_name(tree), []
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals or not key:
-            raise ValueError(f"cannot read {override!r}: write key=value, for example learning_rate=2e-4")
-        changes.append((key.strip(), _read_value(text)))
-    changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
-    for key, value in changes:
-        *parents, last = _full_key(key, names).split(".")
-        reduce(getitem, parents, tree)[last] = value
-    return config_from_tree(tree, type(config))
-
-
 def config_from_tree(tree: Mapping[str, Any], kind: type[Any] = TrainConfig) -> Any:
     """Check plain values (from YAML or JSON) and give the configuration, or one clear error."""
-    try:
-        return kind.model_validate(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise ValueError(f"unknown setting {key!r}{suggestion(key, setting_names(kind))}") from error
-        raise ValueError(f"setting {key!r}: {first['msg']}, got {_SHORT.repr(first['input'])}") from error
+    return checked(tree, kind)
 
 
 def to_yaml(config: Settings) -> str:
@@ -317,45 +282,7 @@ def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
         value = part.pop(last, neutral) if isinstance(part, dict) else neutral
         if value != neutral and neutral is not ...:
             raise ValueError(
-                f"setting {key!r} no longer exists: it can be {neutral}, not {_SHORT.repr(value)}; use an "
+                f"setting {key!r} no longer exists: it can be {neutral}, not {SHORT.repr(value)}; use an "
                 "earlier version of derender"
             )
     return tree
-
-
-def _read_value(text: str) -> Any:
-    """YAML, and numbers such as 1e-4 that YAML 1.1 takes for words."""
-    try:
-        value = parse_yaml(text)
-    except ValueError as error:
-        raise ValueError(
-            f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]"
-        ) from error
-    if isinstance(value, str):
-        with suppress(ValueError):
-            return float(value)
-    return value
-
-
-def settings_by_name(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted name."""
-    leaves: dict[str, Any] = {}
-    for key, value in tree.items():
-        name = f"{prefix}{key}"
-        leaves |= settings_by_name(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return leaves
-
-
-def _full_key(key: str, names: Iterable[str]) -> str:
-    """The dotted name that a key stands for."""
-    if key in names:
-        return key
-    ending = [name for name in names if f".{name}".endswith(f".{key}")]
-    if len(ending) == 1:
-        return ending[0]
-    if ending:
-        raise ValueError(f"{key!r} could mean {' or '.join(ending)}: write it in full")
-    guess = suggestion(key, names) or suggestion(
-        key.rsplit(".", 1)[-1], [name.rsplit(".", 1)[-1] for name in names]
-    )
-    raise ValueError(f"unknown setting {key!r}{guess}: --dry-run lists all of them")

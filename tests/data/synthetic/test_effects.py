@@ -79,7 +79,7 @@ def test_cars_cast_shadows_too():
 def test_settings_are_named_and_bounded_and_maps_are_written(tmp_path):
     given = named_settings(FaceSettings, overrides=["effects.gloss=[0.1,0.5]", "effects.shadows=true"])
     assert given.effects.any and given.effects.gloss == (0.1, 0.5)
-    with pytest.raises(ValueError, match=r"effects.gloss must be two numbers, low <= high, within 0..0.5"):
+    with pytest.raises(ValueError, match=r"gloss': must be two numbers, low <= high, within 0..0.5"):
         named_settings(FaceSettings, overrides=["effects.gloss=[0,2]"])
     with pytest.raises(ValueError, match=r"effects\.lamps"):
         named_settings(FaceSettings, overrides=["effects.lamps=9"])

@@ -16,10 +16,10 @@ import yaml
 from jaxtyping import Float, Int64
 
 from derender.data.doctor import measures
-from derender.data.doctor.measures import JackknifeEstimate, evenly
+from derender.data.doctor.measures import JackknifeEstimate
 from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
-from derender.data.source import is_image
+from derender.data.source import evenly_spaced, is_image
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
@@ -290,7 +290,7 @@ def quick_verdict(images: ImageSet) -> str:
     """The verdict on at most 400 images of a multiple of 32 pixels; "" where they suit, or are others."""
     if images.images.shape[-1] % 32:
         return ""
-    findings = doctor(images.select(evenly(len(images), 400))).findings
+    findings = doctor(images.select(evenly_spaced(len(images), 400))).findings
     if len(images) > 400:  # a sample does not show how many there are
         findings = tuple(finding for finding in findings if finding.name != CHECKS["distinct"].name)
     verdict = verdict_of(findings)
@@ -301,7 +301,7 @@ def _compare(images: ImageSet, rows: np.ndarray, generator: np.random.Generator)
     """Compare distinct images; None of too few."""
     if len(rows) < FEWEST_COMPARED:
         return None
-    rows = rows[evenly(len(rows), COMPARED)]
+    rows = rows[evenly_spaced(len(rows), COMPARED)]
     count, parts = len(rows), np.array_split(rows, -(-len(rows) // 256))
     grey = np.concatenate([measures.shrunk(images.images[part]) for part in parts])
     edges, sides = measures.structure_of(measures.edge_cells(grey)), measures.side_light(grey)
@@ -332,7 +332,7 @@ def _examples(
     examples: dict[str, np.ndarray] = {}
     copies = np.flatnonzero(group != np.arange(len(group)))
     if len(copies):
-        some = copies[evenly(len(copies), SHOWN // 2)]
+        some = copies[evenly_spaced(len(copies), SHOWN // 2)]
         examples["copies, in pairs"] = np.stack([group[some], some], axis=1).ravel()
     if pixels.blank.any():
         examples["empty"] = np.flatnonzero(pixels.blank)
@@ -344,4 +344,4 @@ def _examples(
         for (low, high), values in shared.orders.items():
             order = shared.rows[np.argsort(values)]
             examples |= {low: order[:SHOWN], high: order[::-1][:SHOWN]}
-    return {name: tuple(rows[evenly(len(rows), SHOWN)].tolist()) for name, rows in examples.items()}
+    return {name: tuple(rows[evenly_spaced(len(rows), SHOWN)].tolist()) for name, rows in examples.items()}

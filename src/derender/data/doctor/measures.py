@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from derender.data.image import DECODER_ERRORS, quiet_pillow, upright_size
-from derender.data.source import Source
+from derender.data.source import Source, evenly_spaced
 
 GREY_PX, TINY_PX = 32, 16
 """Sides of the grey images that structure is measured on, and that near copies are found by."""
@@ -85,11 +85,6 @@ class SymmetryAxis:
     correlation: float  # of the two sides, -1..1, best 1
 
 
-def evenly(count: int, most: int) -> Int64[np.ndarray, " k"]:
-    """At most so many of the numbers below ``count``, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, most).astype(int))
-
-
 def measure_pixels(
     images: UInt8[np.ndarray, "n 3 s s"], progress: Callable[[int, int], object] | None = None
 ) -> Pixels:
@@ -133,7 +128,7 @@ def near_copy_groups(tiny: Float32[np.ndarray, "n d"]) -> Int64[np.ndarray, " n"
     colour, mirrored copies, and copies cropped otherwise.
     """
     group = np.arange(len(tiny))
-    sample = tiny[evenly(len(tiny), _SAMPLE)]
+    sample = tiny[evenly_spaced(len(tiny), _SAMPLE)]
     covariance = np.cov(sample, rowvar=False) if len(sample) > 1 else np.eye(tiny.shape[1])
     places = (tiny @ np.linalg.eigh(covariance)[1][:, -_COMPONENTS:]).astype(np.float32)
     standing = group.copy()
@@ -168,7 +163,7 @@ def measure_originals(source: Source, files: tuple[str, ...], image_size: int) -
     """Read the headers of at most 1,000 files, evenly spaced; None if none is readable."""
     sizes = []
     with quiet_pillow():
-        for row in evenly(len(files), min(1_000, len(files))):
+        for row in evenly_spaced(len(files), 1_000):
             try:
                 sizes.append(sorted(upright_size(source.read(files[row]))))
             except DECODER_ERRORS:

@@ -142,8 +142,8 @@ def load_tracks(source: Source) -> Table | None:
     if lists:
         labels = _listed_tracks(source, lists)
         return Table(files, labels) if not files or any(labels["identity"]) else None
-    matches = [match for file in files if (match := _NESTED.fullmatch(file))]
-    return Table(files, track_labels(files, matches)) if len(matches) == len(files) else None
+    labels = track_labels(files, _NESTED)
+    return None if labels is None else Table(files, labels)
 
 
 def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:

@@ -84,8 +84,11 @@ def pairs_of(source: Source) -> dict[str, str]:
     return result
 
 
-def track_labels(files: Sequence[str], matches: Sequence[re.Match[str]]) -> Labels:
-    """Identity, track (unique in the whole set) and frame, of files and the matches of a pattern for them."""
+def track_labels(files: Sequence[str], pattern: re.Pattern[str]) -> Labels | None:
+    """Identity, track (unique in the whole set) and frame; None if a name does not fit the pattern."""
+    matches = [match for file in files if (match := pattern.fullmatch(file))]
+    if len(matches) < len(files):
+        return None
     return {
         "identity": text_column(match["identity"] for match in matches),
         "track": text_column(f"{match['identity']}/{match['track']}" for match in matches),
@@ -150,17 +153,16 @@ def columns(source: Source) -> list[str]:
 
 
 def is_tracks(source: Source) -> bool:
-    return bool(source.images) and all(map(_TRACK.fullmatch, source.images))
+    return bool(source.images) and track_labels(source.images, _TRACK) is not None
 
 
 def load_tracks(source: Source) -> Table | None:
     """Identity and track from the folders, everything else from params.csv where it is there."""
-    matches = [match for file in source.images if (match := _TRACK.fullmatch(file))]
-    if len(matches) < len(source.images):
+    if (tracks := track_labels(source.images, _TRACK)) is None:
         return None
     table = source.named("params.csv")
     labels = {} if table is None else _parameters(source, [table.removesuffix("params.csv")], source.images)
-    return Table(source.images, labels | track_labels(source.images, matches))
+    return Table(source.images, labels | tracks)
 
 
 def is_paired(source: Source) -> bool:

@@ -28,7 +28,7 @@ from derender.storage.atomic import atomic_folder
 __all__ = [
     "CAR_LIGHTS", "CAR_VIEWS", "KINDS", "LIGHTS", "PARTS", "VIEWS", "CarSettings", "CarViewSettings",
     "FaceSettings", "LightSettings", "MorphableFaces", "SyntheticSet", "ViewSettings", "cars", "faces",
-    "named_settings", "write", "write_benchmark", "write_generated",
+    "named_settings", "require_empty", "write", "write_benchmark", "write_generated",
 ]  # fmt: skip
 
 

@@ -68,71 +68,63 @@ def unit(vectors: ndarray) -> ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-@kernel
-def draw_mesh(mesh, rotation, translation, light, background, focal_px, out):
-    """Fill ``out``. The mesh is turned by rotation (3,3) and moved to (0, 0, 1) + translation (3,). Light is
-    a ``Lighting``, background (S,S,3) 0..1.
-    """
-    painted = mesh.values.shape[1] == 2
-    places = np.empty((len(mesh.vertices), 3), np.float32)  # sample column, row, 1 / z
-    more = np.zeros((len(mesh.vertices), 8), np.float32)  # normal, chart or colour, cosine to the light
-    _place(mesh, rotation, translation, focal_px, len(background), light, places, more)
+def draw_mesh(
+    mesh: TriangleMesh, rotation: Float32[ndarray, "3 3"], translation: Float32[ndarray, "3"],
+    light: Lighting, background: Float32[ndarray, "s s 3"], focal_px: np.float32, out: ImageMaps,
+) -> None:  # fmt: skip
+    """Fill ``out`` with the mesh, turned and moved to (0, 0, 1) + ``translation``, before a background of
+    0..1."""
+    places, more = _place(mesh, rotation, translation, focal_px, len(background), light)
     nearest = np.zeros((SAMPLES * len(background), SAMPLES * len(background)), np.float32)
     owner = np.full(nearest.shape, -1, np.int32)
-    number = mesh.number if painted else mesh.number[:0]
+    number = mesh.number if mesh.values.shape[1] == 2 else mesh.number[:0]
     fill_triangles(places, mesh.triangles, number, more, mesh.paint.holes, nearest, owner)
     _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out)
 
 
+def _place(
+    mesh: TriangleMesh, rotation: ndarray, translation: ndarray, focal_px: np.float32, size: int,
+    light: Lighting,
+) -> tuple[Float32[ndarray, "v 3"], Float32[ndarray, "v 8"]]:  # fmt: skip
+    """Column and row of a sample and 1 / z for each vertex; and normal, chart or colour, cosine to the light.
+
+    Normals, in the camera frame, are the mesh's own or means of its triangles'.
+    """
+    camera = _turned(mesh.vertices, rotation) + translation
+    camera[:, 2] += _ONE
+    w = _ONE / camera[:, 2]
+    middle = np.float32(0.5) * np.float32(size - 1)
+    across = np.float32(SAMPLES) * (focal_px * camera[:, :2] * w[:, None] + middle) + _ONE
+    more = np.zeros((len(camera), 8), np.float32)
+    more[:, 3 : 3 + mesh.values.shape[1]] = mesh.values
+    if len(mesh.normals):
+        more[:, :3] = _turned(mesh.normals, rotation)
+    else:
+        a, b, c = camera[mesh.triangles.T]
+        _add_at_corners(mesh.triangles, np.cross(b - a, c - a), more)
+        x, y, z = more[:, :3].T
+        more[:, :3] *= (_ONE / np.maximum(np.sqrt(x * x + y * y + z * z), np.float32(1e-20)))[:, None]
+        more[:, 6] = x * light.lamps[0, 1] + y * light.lamps[0, 2] + z * light.lamps[0, 3]
+    return np.column_stack([across, w]), more
+
+
+def _turned(points: Float32[ndarray, "n 3"], rotation: Float32[ndarray, "3 3"]) -> Float32[ndarray, "n 3"]:
+    """Points turned, in single precision and the same on every machine, as a matrix product is not."""
+    x, y, z = points.T[..., None]
+    return rotation[:, 0] * x + rotation[:, 1] * y + rotation[:, 2] * z
+
+
 @kernel
-def _turned(rotation, x, y, z):
-    return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
-    )
+def _add_at_corners(triangles, vectors, sums):
+    for f in range(len(triangles)):
+        for corner in _corners(triangles, f):
+            for n in range(3):
+                sums[corner, n] += vectors[f, n]
 
 
 @kernel
 def _corners(triangles, f):
     return np.uint32(triangles[f, 0]), np.uint32(triangles[f, 1]), np.uint32(triangles[f, 2])
-
-
-@kernel
-def _place(mesh, rotation, translation, focal_px, size, light, places, more):
-    """Project vertices, and bring normals to the camera frame: the mesh's own, or means of its triangles'."""
-    samples, middle = np.float32(SAMPLES), np.float32(0.5) * np.float32(size - 1)
-    camera = np.empty((len(places), 3), np.float32)
-    for v in range(np.uint32(len(places))):
-        x, y, z = _turned(rotation, mesh.vertices[v, 0], mesh.vertices[v, 1], mesh.vertices[v, 2])
-        x, y, z = x + translation[0], y + translation[1], z + translation[2] + _ONE
-        camera[v, 0], camera[v, 1], camera[v, 2] = x, y, z
-        w = _ONE / z
-        places[v, 0] = samples * (focal_px * x * w + middle) + _ONE
-        places[v, 1] = samples * (focal_px * y * w + middle) + _ONE
-        places[v, 2] = w
-        for k in range(mesh.values.shape[1]):
-            more[v, 3 + k] = mesh.values[v, k]
-    for v in range(np.uint32(len(mesh.normals))):
-        x, y, z = _turned(rotation, mesh.normals[v, 0], mesh.normals[v, 1], mesh.normals[v, 2])
-        more[v, 0], more[v, 1], more[v, 2] = x, y, z
-    if len(mesh.normals):
-        return
-    for t in range(len(mesh.triangles)):
-        a, b, c = _corners(mesh.triangles, t)
-        px, py, pz = camera[b, 0] - camera[a, 0], camera[b, 1] - camera[a, 1], camera[b, 2] - camera[a, 2]
-        qx, qy, qz = camera[c, 0] - camera[a, 0], camera[c, 1] - camera[a, 1], camera[c, 2] - camera[a, 2]
-        x, y, z = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-        for v in (a, b, c):
-            more[v, 0] += x
-            more[v, 1] += y
-            more[v, 2] += z
-    for v in range(np.uint32(len(more))):
-        x, y, z = more[v, 0], more[v, 1], more[v, 2]
-        scale = _ONE / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
-        x, y, z = x * scale, y * scale, z * scale
-        more[v, 0], more[v, 1], more[v, 2] = x, y, z
-        more[v, 6] = x * light.lamps[0, 1] + y * light.lamps[0, 2] + z * light.lamps[0, 3]
 
 
 @kernel
@@ -177,8 +169,10 @@ def fill_triangles(places, triangles, number, more, holes, nearest, owner):
             for u in range(int(np.ceil(max(left, start))), int(np.floor(min(right, end))) + 1):
                 w = min(max(here + np.float32(u) * to_right, low), high)
                 if w > nearest[v, u]:
-                    if pierced and _in_hole(places, more, a, b, c, u, v, holes, number[f]):
-                        continue
+                    if pierced:
+                        at = _seen_at(places, triangles, f, np.float32(u), np.float32(v))
+                        if _in_hole(more, at, holes, number[f]):
+                            continue
                     nearest[v, u] = w
                     owner[v, u] = f
 
@@ -196,19 +190,19 @@ def _crossing(edge, row):
 
 
 @kernel
-def _in_hole(places, more, a, b, c, u, v, holes, k):
-    wa, wb, wc = _weights(places, a, b, c, np.float32(u), np.float32(v))
+def _in_hole(more, at, holes, k):
     inside = False
     for h in range(2):
-        x = wa * more[a, 3] + wb * more[b, 3] + wc * more[c, 3] - holes[k, h, 0]
-        y = wa * more[a, 4] + wb * more[b, 4] + wc * more[c, 4] - holes[k, h, 1]
+        x = _blend(more, 3, at) - holes[k, h, 0]
+        y = _blend(more, 4, at) - holes[k, h, 1]
         inside = inside or x * x + y * y < holes[k, h, 2] * holes[k, h, 2]
     return inside
 
 
 @kernel
-def _weights(places, a, b, c, column, row):
-    """Weights of a triangle's corners at a sample, with perspective."""
+def _seen_at(places, triangles, f, column, row):
+    """The corners of a triangle, and their weights at a sample, with perspective."""
+    a, b, c = _corners(triangles, f)
     ax, ay = places[a, 0] - column, places[a, 1] - row
     bx, by = places[b, 0] - column, places[b, 1] - row
     cx, cy = places[c, 0] - column, places[c, 1] - row
@@ -216,90 +210,87 @@ def _weights(places, a, b, c, column, row):
     wb = (cx * ay - cy * ax) * places[b, 2]
     wc = (ax * by - ay * bx) * places[c, 2]
     scale = _ONE / (wa + wb + wc)
-    return wa * scale, wb * scale, wc * scale
+    return a, b, c, wa * scale, wb * scale, wc * scale
 
 
 @kernel
-def _blend(more, k, a, b, c, wa, wb, wc):
-    return wa * more[a, k] + wb * more[b, k] + wc * more[c, k]
+def _blend(more, k, at):
+    return at[3] * more[at[0], k] + at[4] * more[at[1], k] + at[5] * more[at[2], k]
+
+
+@kernel
+def _blend_three(more, k, at):
+    return _blend(more, k, at), _blend(more, k + 1, at), _blend(more, k + 2, at)
 
 
 @kernel
 def _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out):
-    painted, share, scale = mesh.values.shape[1] == 2, np.float32(1.0 / _ALL), _ONE
-    weight = np.empty((_ALL, 3), np.float32)  # of the corners of each sample's triangle
+    painted, side = mesh.values.shape[1] == 2, len(background)
     surface = np.empty(_ALL, np.int32)  # of each sample, -1 on the background
     spot = np.zeros((2, _ALL), np.float32)  # place on the chart
     inside = np.empty(_ALL, np.bool_)
     colour = np.empty((_ALL, 3), np.float32)
-    part = np.empty(_ALL, np.int32)
+    part, total = np.empty(_ALL, np.int32), np.empty(3, np.float32)
     plain, lamp, result, air = is_plain(light), light.lamps[0], np.ones(4, np.float32), light.haze[1]
     result[2] = _ZERO
+    depth, cosine, normal = _ONE, _ZERO, (_ZERO, _ZERO, _ZERO)
     span, veil = depths_seen(nearest), np.exp(-light.haze[0])  # of what is farthest, and of the background
-    for i in range(np.uint32(len(background))):
-        for j in range(np.uint32(len(background))):
-            seen = 0
-            for s in range(np.uint32(_ALL)):
-                u, v = SAMPLES * j + s % SAMPLES, SAMPLES * i + s // SAMPLES
-                f = owner[v, u]
-                surface[s] = -1
-                if f < 0:
-                    continue
-                seen += 1
-                a, b, c = _corners(mesh.triangles, np.uint32(f))
-                wa, wb, wc = _weights(places, a, b, c, np.float32(u), np.float32(v))
-                weight[s, 0], weight[s, 1], weight[s, 2] = wa, wb, wc
-                surface[s] = 0
-                if painted:
-                    surface[s] = mesh.number[f]
-                    p = _blend(more, 3, a, b, c, wa, wb, wc)
-                    spot[0, s] = abs(p) if mesh.paint.folded[surface[s]] else p
-                    spot[1, s] = _blend(more, 4, a, b, c, wa, wb, wc)
-            if painted and seen:
-                paint_samples(mesh.paint, surface, spot, inside, colour, part)
-            empty, behind = np.float32(_ALL - seen), background[i, j]
+    for pixel in range(np.uint32(side * side)):
+        i, j, seen = pixel // side, pixel % side, 0
+        for s in range(np.uint32(_ALL)):
+            u, v = SAMPLES * j + s % SAMPLES, SAMPLES * i + s // SAMPLES
+            f = owner[v, u]
+            surface[s] = -1
+            if f < 0:
+                continue
+            seen += 1
+            surface[s] = 0
+            if painted:
+                at = _seen_at(places, mesh.triangles, np.uint32(f), np.float32(u), np.float32(v))
+                surface[s] = mesh.number[f]
+                p = _blend(more, 3, at)
+                spot[0, s] = abs(p) if mesh.paint.folded[surface[s]] else p
+                spot[1, s] = _blend(more, 4, at)
+        if painted and seen:
+            paint_samples(mesh.paint, surface, spot, inside, colour, part)
+        for n in range(3):
+            behind = background[i, j, n]
             if light.haze[0] > _ZERO:
                 behind = behind * veil + air * (_ONE - veil)
-            red, green, blue = empty * behind[0], empty * behind[1], empty * behind[2]
-            for s in range(np.uint32(_ALL if seen else 0)):
-                if surface[s] < 0:
-                    continue
-                f = np.uint32(owner[SAMPLES * i + s // SAMPLES, SAMPLES * j + s % SAMPLES])
-                a, b, c = _corners(mesh.triangles, f)
-                wa, wb, wc = weight[s, 0], weight[s, 1], weight[s, 2]
-                x, y, z = _ZERO, _ZERO, _ZERO
-                if painted or s == _MIDDLE or not plain:
-                    x = _blend(more, 0, a, b, c, wa, wb, wc)
-                    y = _blend(more, 1, a, b, c, wa, wb, wc)
-                    z = _blend(more, 2, a, b, c, wa, wb, wc)
-                    scale = _ONE / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
-                if painted:
-                    cosine = (x * lamp[1] + y * lamp[2] + z * lamp[3]) * scale
-                else:
-                    cosine = _blend(more, 6, a, b, c, wa, wb, wc)
-                    for n in range(3):
-                        colour[s, n] = _blend(more, 3 + n, a, b, c, wa, wb, wc)
-                result[0] = light.ambient + lamp[0] * max(_ZERO, cosine)
-                if not plain:
-                    u = np.float32(j + (s % SAMPLES - 1) / SAMPLES)
-                    v = np.float32(i + (s // SAMPLES - 1) / SAMPLES)
-                    place = u, v, _ONE / _blend(places, 2, a, b, c, wa, wb, wc), focal_px, len(background)
-                    light_at(light, place, (x * scale, y * scale, z * scale), span, result)
-                lit, shine, passed, veiled = result[0], result[2], result[3], air * (_ONE - result[3])
-                red += min((colour[s, 0] * lit + shine) * passed + veiled, _ONE)
-                green += min((colour[s, 1] * lit + shine) * passed + veiled, _ONE)
-                blue += min((colour[s, 2] * lit + shine) * passed + veiled, _ONE)
-                if s == _MIDDLE:
-                    if not painted:
-                        part[s] = mesh.number[a if wa >= max(wb, wc) else (b if wb >= wc else c)]
-                    out.mask[i, j], out.parts[i, j] = True, part[s]
-                    out.depth[i, j] = _ONE / _blend(places, 2, a, b, c, wa, wb, wc)
-                    out.normal[i, j, 0], out.normal[i, j, 1] = x * scale, y * scale
-                    out.normal[i, j, 2] = z * scale
-                    _store(out.albedo, i, j, colour[s])
-                    if len(out.effects):
-                        out.effects[:, i, j] = result
-            _store(out.image, i, j, (red * share, green * share, blue * share))
+            total[n] = np.float32(_ALL - seen) * behind
+        for s in range(np.uint32(_ALL if seen else 0)):
+            if surface[s] < 0:
+                continue
+            u, v = SAMPLES * j + s % SAMPLES, SAMPLES * i + s // SAMPLES
+            at = _seen_at(places, mesh.triangles, np.uint32(owner[v, u]), np.float32(u), np.float32(v))
+            if painted or s == _MIDDLE or not plain:
+                x, y, z = _blend_three(more, 0, at)
+                scale = _ONE / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
+                cosine, normal = (
+                    (x * lamp[1] + y * lamp[2] + z * lamp[3]) * scale,
+                    (x * scale, y * scale, z * scale),
+                )
+                depth = _ONE / _blend(places, 2, at)
+            if not painted:
+                cosine = _blend(more, 6, at)
+                colour[s, 0], colour[s, 1], colour[s, 2] = _blend_three(more, 3, at)
+            result[0] = light.ambient + lamp[0] * max(_ZERO, cosine)
+            if not plain:
+                column, row = np.float32((u - 1) / SAMPLES), np.float32((v - 1) / SAMPLES)
+                light_at(light, (column, row, depth, focal_px, side), normal, span, result)
+            for n in range(3):
+                lit = (colour[s, n] * result[0] + result[2]) * result[3] + air * (_ONE - result[3])
+                total[n] += min(lit, _ONE)
+            if s == _MIDDLE:
+                if not painted:
+                    most = max(at[3], at[4], at[5])
+                    part[s] = mesh.number[at[0] if at[3] == most else at[1] if at[4] == most else at[2]]
+                out.mask[i, j], out.parts[i, j], out.depth[i, j] = True, part[s], depth
+                out.normal[i, j, 0], out.normal[i, j, 1], out.normal[i, j, 2] = normal
+                _store(out.albedo, i, j, colour[s])
+                if len(out.effects):
+                    out.effects[:, i, j] = result
+        _store(out.image, i, j, total * np.float32(1.0 / _ALL))
 
 
 @kernel

@@ -8,17 +8,17 @@ it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import yaml
 from numpy import ndarray
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field
 
+from derender.overrides import with_changes
 from derender.settings import Settings
-from derender.storage.bounded import parse_yaml
+from derender.storage.places import require_known
 
 Kind = TypeVar("Kind", bound=Settings)
 Range = tuple[float, float]
@@ -257,34 +257,13 @@ class CarSettings(Settings):
 def named_settings(
     kind: type[Kind], light: str = "usual", view: str = "usual", overrides: Iterable[str] = (), **own: Any
 ) -> Kind:
-    """Settings by the names of their lighting and viewpoints, own values by keyword, then overrides such as
-    ``light.yaw_deg=[-60,60]``. Keys are dotted, values are YAML.
+    """Settings by the names of their lighting and viewpoints, with own values by keyword.
 
-    Raises:
-        ValueError: an unknown name, text that is not key=value, an unknown key (the known ones are listed),
-            or a bad value.
+    Overrides such as ``light.yaw_deg=[-60,60]`` come last. A ValueError: an unknown name, or as
+    ``with_changes`` raises it.
     """
     lights, views = (LIGHTS, VIEWS) if kind is FaceSettings else (CAR_LIGHTS, CAR_VIEWS)
     for option, name, known in (("light", light, lights), ("view", view, views)):
-        if name not in known:
-            raise ValueError(f"{option} must be one of {', '.join(known)}, got {name!r}")
-    tree = kind.model_validate(own | {"light": lights[light], "view": views[view]}).model_dump()
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals:
-            raise ValueError(f"cannot read {override!r}: write key=value, for example light.yaw_deg=[-60,60]")
-        parent, _, last = (key := key.strip()).rpartition(".")
-        branch = tree.get(parent) if parent else tree
-        if not isinstance(branch, dict) or last not in branch:
-            nested = ([f"{k}.{n}" for n in v] if isinstance(v, dict) else [k] for k, v in tree.items())
-            raise ValueError(f"unknown setting {key!r}; there are {', '.join(chain(*nested))}")
-        try:
-            branch[last] = parse_yaml(text)
-        except ValueError as error:
-            raise ValueError(f"cannot read the value {text!r} of {key}") from error
-    try:
-        return kind.model_validate(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ValueError(f"{where} {first['msg'].removeprefix('Value error, ')}") from error
+        require_known(option, name, tuple(known))
+    chosen = kind.model_validate(own | {"light": lights[light], "view": views[view]})
+    return with_changes(chosen, overrides)

@@ -146,7 +146,8 @@ class Application:
             gets[path] = partial(_page_file, content, media_type)
         routes = [Route(path, answer, methods=["POST"]) for path, answer in posts.items()]
         routes += [Route(path, answer, methods=["GET"]) for path, answer in gets.items()]
-        handlers: dict[Any, Any] = dict.fromkeys((HTTPException, Refused, ClientDisconnect), _problem)
+        handled = (HTTPException, Refused, ValueError, ClientDisconnect)
+        handlers: dict[Any, Any] = dict.fromkeys(handled, _problem)
         self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
 
     def close(self, *, wait: bool = True) -> None:
@@ -243,7 +244,9 @@ async def _page_file(content: bytes, media_type: str, request: Request) -> Respo
     return Response(content, media_type=media_type)
 
 
-async def _problem(request: Request, problem: HTTPException | Refused | ClientDisconnect) -> Response:
+async def _problem(request: Request, problem: Exception) -> Response:
+    if isinstance(problem, ValueError):  # of a question that makes no sense for this model or image
+        problem = Refused(422, str(problem))
     if isinstance(problem, Refused):
         ended = {"connection": "close"} if problem.status in (408, 413) else None  # its rest may never come
         return JSONResponse({"error": problem.message}, problem.status, headers=ended)

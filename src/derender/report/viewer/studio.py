@@ -1,9 +1,9 @@
 """Requests of the page, answered: images opened, shown under other light and view, as maps, mesh, archive.
 
-Takes questions and gives bytes and plain values; knows no HTTP. Opened images stay in memory only, a bounded
-number of them. Factors of several images are joined at the model's size. Drawn is a photograph with the crop
-changed in its own detail, or the model's rendering. Not safe for several threads at once: the server gives it
-one.
+Takes questions and gives bytes and plain values; knows no HTTP. A question without an answer is a ValueError.
+Opened images stay in memory only, a bounded number of them. Factors of several images are joined at the
+model's size. Drawn is a photograph with the crop changed in its own detail, or the model's rendering. Not
+safe for several threads at once: the server gives it one.
 """
 
 import io
@@ -124,7 +124,7 @@ class Studio:
         """An opened image decomposed again: another crop, or its scene optimised; returns as `open` does."""
         opened, crop = self.shelf.get(question.picture), question.crop
         if question.fit and self.model.fitting is None:
-            raise Refused(422, "fit: this model cannot optimise scenes per image; ask without it")
+            raise ValueError("fit: this model cannot optimise scenes per image; ask without it")
         frame, framed, (height, width) = opened.frame, opened.framed, opened.photo.shape[:2]
         if isinstance(crop, Place):
             side = min(crop.side, 2.0 * max(height, width))
@@ -140,10 +140,7 @@ class Studio:
         looked_for = template_of(self.model) is not None and min(photo.shape[:2]) > self.model.image_size
         if faces and way in (None, "face"):
             return faces[0], "face"
-        try:
-            frame, framed = found_frame(photo, self.model, "none" if looked_for and way is None else way)
-        except ValueError as problem:
-            raise Refused(422, str(problem)) from problem
+        frame, framed = found_frame(photo, self.model, "none" if looked_for and way is None else way)
         return frame, "no face" if looked_for and way is None else framed
 
     def _decomposed(
@@ -193,12 +190,9 @@ class Studio:
             scene = scene.with_parameters(camera=question.camera.camera_row())
         for factor, values in question.numbers.items():
             if factor not in (own := self._numbers(scene)):
-                raise Refused(422, f"numbers: this model has no {factor!r}; it has {', '.join(own)}")
+                raise ValueError(f"numbers: this model has no {factor!r}; it has {', '.join(own)}")
             scene = scene.with_parameters(**{parameters[factor]: torch.tensor([values])})
-        try:
-            self.model.renderer.check(scene)
-        except ValueError as problem:
-            raise Refused(422, str(problem)) from problem
+        self.model.renderer.check(scene)
         return scene
 
     def _numbers(self, scene: Scene) -> dict[str, list[float]]:
@@ -235,10 +229,7 @@ class Studio:
         move, reach_deg = moves[question.move]
         scenes = move(scene, FILM_FRAMES, reach_deg)
         frames = [self._drawn(question, scenes[number]) for number in range(len(scenes))]
-        try:
-            return FILMS[question.kind](frames, FILM_SECONDS)
-        except ValueError as problem:
-            raise Refused(422, str(problem)) from problem
+        return FILMS[question.kind](frames, FILM_SECONDS)
 
     def maps(self, question: ViewRequest) -> dict[str, Image.Image]:
         """Input, its reconstruction, and the factors of the requested view, by name."""
@@ -274,22 +265,16 @@ class Studio:
         return packed.getvalue()
 
     def mesh(self, question: ViewRequest) -> bytes:
-        """The surface in its canonical view as GLB; ``Refused`` (422) where there is none.
-
-        Its texture has the requested size.
-        """
+        """The surface in its canonical view as GLB, its texture of the requested size."""
         scene = at_size(self.scene(question), max(SURFACE_SIZE, self.model.image_size))
-        try:
-            texture = None
-            if question.detail == "photo":
-                opened = self.shelf.get(_source(question))
-                pixels = as_float(opened.frame.cut(opened.photo, self._size(question))[None])[0]
-                with torch.inference_mode():
-                    fov_deg, renderer = self.model.fov_deg, self.model.renderer
-                    texture = PhotoDetail(pixels, opened.scene, fov_deg, renderer=renderer).albedo()
-            return model_mesh(self.model, scene, texture=texture).files("surface")["surface.glb"]
-        except ValueError as problem:
-            raise Refused(422, str(problem)) from problem
+        texture = None
+        if question.detail == "photo":
+            opened = self.shelf.get(_source(question))
+            pixels = as_float(opened.frame.cut(opened.photo, self._size(question))[None])[0]
+            with torch.inference_mode():
+                fov_deg, renderer = self.model.fov_deg, self.model.renderer
+                texture = PhotoDetail(pixels, opened.scene, fov_deg, renderer=renderer).albedo()
+        return model_mesh(self.model, scene, texture=texture).files("surface")["surface.glb"]
 
     def settings(self, question: ViewRequest) -> dict[str, Any]:
         """Light and camera in numbers, and how the image was made."""
@@ -313,12 +298,8 @@ class Studio:
         table = self.searched().table
         other = dict(question.swaps).get(question.factor, question.picture)  # type: ignore[call-overload]
         features = self.shelf.get(other).features
-        try:
-            feature = named(features, question.factor, "factor")
-            itself = same_image(table, features)
-            rows, away = nearest(table, feature, question.factor, question.k, exclude=itself.tolist())
-        except ValueError as problem:
-            raise Refused(422, str(problem)) from problem
+        feature, itself = named(features, question.factor, "factor"), same_image(table, features).tolist()
+        rows, away = nearest(table, feature, question.factor, question.k, exclude=itself)
         return list(zip(rows.tolist(), away.tolist(), strict=True))
 
     def searched(self) -> Gallery:
