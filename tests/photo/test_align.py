@@ -15,7 +15,7 @@ from derender.data.synthetic import faces
 from derender.data.synthetic.settings import FaceSettings
 from derender.photo import Face, Frame, find_faces
 from derender.photo.align import AFFINE, COLUMNS, _write
-from derender.photo.faces import RENDERED, TEMPLATES, UTKFACE, YAW_PER_SHARE, frame_of
+from derender.photo.faces import BOTH_FAMILIES, TEMPLATES, UTKFACE, YAW_PER_SHARE, frame_of
 from derender.report.viewer.images import rendered_examples
 
 MODULE = sys.modules["derender.photo.align"]  # the package has the function by that name
@@ -60,7 +60,7 @@ def test_every_face_lies_where_the_model_has_it(aligned):
     for name in ("two/pair.png", "two/pair-2.png"):
         large = Image.open(out / name).resize((256, 256), Image.Resampling.BICUBIC)
         (face,) = find_faces(np.asarray(large))
-        assert np.abs(face.points / 256 - RENDERED)[[0, 1, 3, 4]].max() < 0.04  # the nose turns
+        assert np.abs(face.points / 256 - BOTH_FAMILIES)[[0, 1, 3, 4]].max() < 0.04  # the nose turns
     reasons = {row["photo"]: row["rejected"] for row in done.rows if not row["file"]}
     assert reasons["none.png"] == "no face found" and "known format" in reasons["broken.jpg"]
 

@@ -9,7 +9,7 @@ from tests.photo.test_align import scene
 import derender
 from derender.photo import Frame, find_faces, found_frame, open_photograph
 from derender.photo.edit import FIT_STEPS
-from derender.photo.faces import RENDERED, frame_of
+from derender.photo.faces import BOTH_FAMILIES, frame_of
 from derender.postprocess import Features
 
 
@@ -25,16 +25,16 @@ def photo() -> Image.Image:
 
 def test_the_face_is_found_where_it_is(photo):
     (face,) = find_faces(np.asarray(photo))
-    frame = frame_of(face, RENDERED)
+    frame = frame_of(face, BOTH_FAMILIES)
     assert abs(frame.x - 278) < 25 and abs(frame.y - 208) < 25
     assert abs(frame.side - 256) < 50 and abs(frame.roll_deg) < 10
 
 
 @pytest.mark.parametrize("roll", [-20.0, 20.0])
 def test_a_rolled_face_gives_a_rolled_frame(photo, roll):
-    upright = frame_of(find_faces(np.asarray(photo))[0], RENDERED).roll_deg
+    upright = frame_of(find_faces(np.asarray(photo))[0], BOTH_FAMILIES).roll_deg
     (face,) = find_faces(np.asarray(scene((0, 256, (150, 80), roll))))
-    assert abs(frame_of(face, RENDERED).roll_deg - upright - roll) < 5
+    assert abs(frame_of(face, BOTH_FAMILIES).roll_deg - upright - roll) < 5
 
 
 def test_frames_by_name(photo, model):

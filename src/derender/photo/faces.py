@@ -34,15 +34,13 @@ Template = tuple[tuple[float, float], ...]
 """Where five points lie in a training crop: shares of its side from the left and from the top."""
 
 UTKFACE: Template = ((0.303, 0.299), (0.697, 0.299), (0.5, 0.547), (0.322, 0.720), (0.678, 0.720))
-RENDERED: Template = ((0.311, 0.283), (0.689, 0.283), (0.5, 0.508), (0.347, 0.731), (0.653, 0.731))
-"""Medians over 292 images of UTKFace and 268 of rendered heads of a morphable model, made symmetric."""
+"""Medians over 292 images of UTKFace, made symmetric."""
 BOTH_FAMILIES: Template = ((0.322, 0.313), (0.678, 0.313), (0.5, 0.53), (0.358, 0.741), (0.642, 0.741))
 """Between the medians over 366 heads of a morphable model and 362 generated ones, whose faces are smaller."""
 
 TEMPLATES = {
     **dict.fromkeys(("faces-64", "faces-128"), UTKFACE),
-    "rendered-faces-64": BOTH_FAMILIES,
-    "rendered-faces-128": RENDERED,
+    **dict.fromkeys(("rendered-faces-64", "rendered-faces-128"), BOTH_FAMILIES),
 }
 POINTS = ("left_eye", "right_eye", "nose", "mouth_left", "mouth_right")
 
