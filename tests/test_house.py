@@ -18,16 +18,16 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (7_415, 32),
     "evaluation": (7_425, 36),  # public functions name their errors
-    "report": (4_030, 25),
-    "cli": (2_315, 32),  # pack refuses options without effect
+    "report": (4_050, 25),  # one process writes to a folder of images
+    "cli": (2_325, 32),  # errors of the system with what to do
     "training": (3_485, 17),  # CUDA graphs
     "baselines": (2_485, 11),
     "render": (1_690, 15),
-    "features": (1_385, 8),
+    "features": (1_390, 8),  # a folder is refused before images are embedded
     "interpretation": (1_085, 5),
     "photo": (1_520, 7),  # the surface that is shaded is smoothed
     "networks": (710, 5),
-    "storage": (945, 7),  # only saved folders are replaced
+    "storage": (965, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
     "postprocess": (845, 6),
     "scene": (860, 11),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_630, 246)  # on the way to (37_000, 270)
-TEST_LINES = 25_880
+TOTAL = (39_680, 246)  # on the way to (37_000, 270)
+TEST_LINES = 25_930
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -5,12 +5,14 @@ import json
 import os
 import re
 import shutil
+import sys
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from filelock import FileLock
 from PIL import Image
 from tests.cli.conftest import noise, run
 
@@ -19,6 +21,7 @@ from derender.report.edits import Edit
 from derender.report.options import ImageOptions
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
+from derender.training.process import LOCK_FILE
 
 SIZE = 32
 
@@ -196,6 +199,28 @@ def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, 
     assert (out / "1" / "strip.png").stat().st_mtime_ns == kept
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are text there")
+def test_a_name_that_is_no_utf8(tiny, photos, tmp_path, numbers):
+    odd = os.fsencode(tmp_path) + b"/a\xff.png"
+    shutil.copy(photos / "0.png", odd)
+    for command in ("decompose", "relight"):
+        words = (command, "-m", tiny, os.fsdecode(odd), "-o", tmp_path / command)
+        told, _ = numbers(*words, *(["--film", "none"] if command == "relight" else []))
+        assert told["pictures"][0]["picture"] == os.fsdecode(odd)
+
+
+def test_two_processes_do_not_write_to_one_folder(tiny, photos, tmp_path, refused):
+    out = tmp_path / "out"
+    words = ("mesh", "-m", tiny, photos / "0.png", "-o", out)
+    (out / ".sheet").mkdir(parents=True)
+    with FileLock(out / ".sheet" / LOCK_FILE):
+        assert "is being written by another process" in refused(*words)
+    assert run(*words) == 0 and [entry.name for entry in out.iterdir()] == ["0"]
+    (tmp_path / "link").symlink_to("nothing")
+    assert "a file or a broken link: choose another place" in refused(*words[:-1], tmp_path / "link")
+    assert "a file or a broken link" in refused("embed", *words[1:3], "-d", photos, "-o", out / "0/0.glb/x")
+
+
 def test_results_among_the_images_are_no_images(tiny, tmp_path, numbers, refused):
     words = ("decompose", "-m", tiny, noise(tmp_path / "in", 3), "-o")
     for _ in range(2):
@@ -242,9 +267,8 @@ def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user whom permissions bind")
 def test_a_folder_that_may_not_be_written(tiny, photos, tmp_path, refused):
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    assert "permission denied" in refused("mesh", "-m", tiny, photos / "0.png", "-o", locked / "out")
+    (closed := tmp_path / "locked").mkdir(mode=0o500)
+    assert "permission denied" in refused("mesh", "-m", tiny, photos / "0.png", "-o", closed / "out")
 
 
 def test_bad_searches(table, tiny, photos, tmp_path, refused):

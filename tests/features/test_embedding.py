@@ -210,6 +210,8 @@ def test_bad_input_leaves_nothing(model, tmp_path, out):
         streamed(model, str(bad), out)
     with pytest.raises(ValueError, match="batch_size must be 1 or more, got 0"):
         streamed(model, str(bad), out, batch_size=0)
+    with pytest.raises(ValueError, match="is a folder: name a file"):
+        streamed(model, str(bad), bad)
     (bad / "c.png").write_bytes(png(1))
     model.b[:] = np.nan
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in 1 of 1 rows, first in c\.png"):

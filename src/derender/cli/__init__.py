@@ -46,6 +46,15 @@ app = typer.Typer(
 )
 
 
+_REMEDIES = {
+    errno.ENOSPC: "; free some space and run the command again",
+    errno.EEXIST: ", a file or a broken link: choose another place",
+    errno.ENOTDIR: ": a part of it is a file or a broken link: choose another place",
+    errno.EACCES: ": change the permissions or choose another place",
+    errno.EROFS: ": choose another place",
+}
+
+
 def _show_version(wanted: bool) -> bool:
     if wanted:
         typer.echo(f"derender {__version__}")
@@ -100,8 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message = str(error) or type(error).__name__
         if isinstance(error, OSError) and error.errno is not None and error.strerror:
             where = f"{error.filename}: " if error.filename is not None else ""
-            hint = "; free some space and run the command again" if error.errno == errno.ENOSPC else ""
-            message = f"{where}{error.strerror.lower()}{hint}"
+            message = f"{where}{error.strerror.lower()}{_REMEDIES.get(error.errno, '')}"
         _complain(message)
         return 2
     except Exception as error:

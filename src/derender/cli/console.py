@@ -139,13 +139,14 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
     from derender.settings import plain
 
     text = json.dumps(plain(values), indent=1, ensure_ascii=False) + "\n"
+    text = text.encode("utf-8", errors="backslashreplace").decode()  # names of files that are no UTF-8
     if target == "-":
         sys.stdout.write(text)
         sys.stdout.flush()
     else:
         from derender.storage.atomic import write_whole
 
-        write_whole(target, text.encode("utf-8", errors="replace"))
+        write_whole(target, text)
 
 
 def refuse_existing_file(path: Path, force: bool) -> None:

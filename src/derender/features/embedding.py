@@ -29,7 +29,7 @@ from derender.data import (
 )
 from derender.features.blocks import PARTS_FORMAT, Parts, Rows, local_blocks, ray_blocks, rows_of
 from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
-from derender.features.parquet import write_tables
+from derender.features.parquet import refuse_folder, write_tables
 from derender.features.table import FeatureTable
 from derender.inputs import Progress, as_images, as_model
 from derender.storage.places import counted, model_folder, require_known
@@ -127,6 +127,7 @@ def embed_to_file(
         raise ValueError(
             f"{out}: a feature table is a parquet file, name it so (pandas.read_parquet reads it)"
         )
+    refuse_folder(Path(out))
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
     require_known("engine", engine, ENGINES)

@@ -26,14 +26,19 @@ FORMAT = 1
 METADATA_KEY = b"derender"
 
 
+def refuse_folder(path: Path) -> None:
+    """ValueError where a table would be written onto a folder."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
+
+
 def write_tables(path: Path, groups: Iterable[FeatureTable]) -> None:
     """Write a table that need never be whole in memory, each of ``groups`` as a row group.
 
     All groups have the same factors, labels and origin. At ``path`` stands the old file or the whole new one,
     never half of it.
     """
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder: name a file to write, such as {path / 'features.parquet'}")
+    refuse_folder(path)
     writer = None
     with atomic_file(path, durable=True) as temporary:
         try:

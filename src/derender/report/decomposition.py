@@ -78,7 +78,7 @@ class Decomposition:
         for name, image in self.row.items():
             strip([image]).save(folder / f"{name.replace(' ', '_')}.png")
         text = json.dumps(written, indent=1, ensure_ascii=False)
-        (folder / "scene.json").write_text(text, encoding="utf-8")
+        (folder / "scene.json").write_text(text, encoding="utf-8", errors="backslashreplace")
         values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in scene.parameters.items()}
         values["normal"] = normals_from_depth(scene.depth, self.fov_deg)[0].cpu().numpy()
         np.savez_compressed(folder / "scene.npz", **values)

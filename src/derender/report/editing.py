@@ -9,7 +9,8 @@ read is left out and listed; the others are written. Leaves out opening (``openi
 import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,6 +26,7 @@ from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
 from derender.storage.atomic import atomic_file, atomic_folder
 from derender.storage.places import counted
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, unlike
+from derender.training.process import locked
 
 FILM = "film.mp4"
 ROWS = ".sheet"
@@ -93,13 +95,15 @@ class WrittenImages:
         return lines
 
     def values(self) -> dict[str, Any]:
-        """All of it as JSON can hold it."""
+        """All of it as JSON can hold it; keys are paths, for a name may be no UTF-8."""
+        by_path = (self.refused, self.percentiles, self.framing)
+        refused, percentiles, framing = ({Path(key): one for key, one in rows.items()} for rows in by_path)
         return {
             "out": self.out,
             "pictures": self.images,
-            "refused": self.refused,
-            "reconstruction_percentile": self.percentiles,
-            "framing": self.framing,
+            "refused": refused,
+            "reconstruction_percentile": percentiles,
+            "framing": framing,
             "sheets": self.sheets,
         }
 
@@ -126,7 +130,7 @@ def write_images(
 
     Raises:
         FileExistsError: something would be replaced, and ``force`` is off.
-        ValueError: no image can be read, or the edit is impossible.
+        ValueError: no image can be read, the edit is impossible, or another process writes to ``out``.
     """
     files = image_files(paths, out)
     places, kept = _places(files, out), out / ROWS
@@ -150,39 +154,40 @@ def write_images(
     records: list[dict[str, Any]] = []
     folders = [places[path] for path in read]
     _require_free([*folders, *(places[path] for path in moving)], out, with_sheet, force or resume)
-    images = opener.decomposed(read) if read else []
-    for image, folder in zip(images, folders, strict=True):
-        made = edit(opener.finer(image))
-        if with_sheet:
-            cells = {name: np.asarray(enlarged(one, SHEET.cell)) for name, one in made.row.items()}
-            with atomic_file(shown[image.path]) as temporary, temporary.open("wb") as stream:
-                np.savez(stream, allow_pickle=False, **cells)
-        with atomic_folder(folder) as temporary:
-            records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
-        progress(len(records), len(images), description="drawing")
-    for path in moving:
-        assert video is not None
-        try:
-            with atomic_folder(places[path]) as temporary:
-                film = edit_video(
-                    path, temporary / FILM, opener.model, video, frame=opener.options.frame,
-                    fit_steps=opener.options.fit_steps, progress=progress,
-                )  # fmt: skip
-                record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
-                (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
-        except (ValueError, OSError) as problem:
-            refused[str(path)] = " ".join(str(problem).split())
-        else:
-            records.append(record)
-    if refused and not records and not done:
-        raise ValueError(next(iter(refused.values())))
-    rows = [(file.name, _row(row)) for file, row in shown.items()] if with_sheet else []
-    rows = [row for row in rows if row[1]]
-    files = _sheet_files(out, len(rows))
-    for file, drawn in zip(files, row_sheets(rows), strict=True):
-        with atomic_file(file) as temporary:
-            drawn.save(temporary, format="PNG")
-    shutil.rmtree(kept, ignore_errors=True)
+    with _alone(out):
+        images = opener.decomposed(read) if read else []
+        for image, folder in zip(images, folders, strict=True):
+            made = edit(opener.finer(image))
+            if with_sheet:
+                cells = {name: np.asarray(enlarged(one, SHEET.cell)) for name, one in made.row.items()}
+                with atomic_file(shown[image.path]) as temporary, temporary.open("wb") as stream:
+                    np.savez(stream, allow_pickle=False, **cells)
+            with atomic_folder(folder) as temporary:
+                records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
+            progress(len(records), len(images), description="drawing")
+        for path in moving:
+            assert video is not None
+            try:
+                with atomic_folder(places[path]) as temporary:
+                    film = edit_video(
+                        path, temporary / FILM, opener.model, video, frame=opener.options.frame,
+                        fit_steps=opener.options.fit_steps, progress=progress,
+                    )  # fmt: skip
+                    record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
+                    (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+            except (ValueError, OSError) as problem:
+                refused[str(path)] = " ".join(str(problem).split())
+            else:
+                records.append(record)
+        if refused and not records and not done:
+            raise ValueError(next(iter(refused.values())))
+        rows = [(file.name, _row(row)) for file, row in shown.items()] if with_sheet else []
+        rows = [row for row in rows if row[1]]
+        files = _sheet_files(out, len(rows))
+        for file, drawn in zip(files, row_sheets(rows), strict=True):
+            with atomic_file(file) as temporary:
+                drawn.save(temporary, format="PNG")
+        shutil.rmtree(kept, ignore_errors=True)
     every = [*images, *beside]
     percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
     framing = {str(one.path): one.framing for one in every}
@@ -191,6 +196,19 @@ def write_images(
         odd = unlike(np.stack([one.pixels for one in every]), [one.percentile or 0 for one in every])
     before = len(places) - len(records) - len(refused)
     return WrittenImages(out, records, files, refused, percentiles, framing, odd, before)
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Keep other processes from writing images to a folder; it goes again if it was made and stays empty."""
+    made = not out.exists()
+    try:
+        with locked(out / ROWS):
+            yield
+    finally:
+        if made:
+            with suppress(OSError):  # it has files, as a rule
+                out.rmdir()
 
 
 def _row(file: Path) -> dict[str, Image.Image]:

@@ -69,7 +69,7 @@ class Edit:
                 (folder / f"film.{kind}").write_bytes(film.result())
         written = {**record, "stills": stills}
         text = json.dumps(written, indent=1, ensure_ascii=False)
-        (folder / "moved.json").write_text(text, encoding="utf-8")
+        (folder / "moved.json").write_text(text, encoding="utf-8", errors="backslashreplace")
         return written
 
 

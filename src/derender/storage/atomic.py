@@ -36,10 +36,12 @@ class DamageNoticed(UserWarning):
 def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Give a temporary path to write to; it takes the place of ``path`` if nothing is raised.
 
-    ``durable`` has the disk keep the content before the name.
+    ``durable`` has the disk keep the content before the name. A link stays, and what it leads to is replaced.
     """
+    path = _linked(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=_prefix(path), dir=path.parent)
+    with _naming(path):
+        handle, name = tempfile.mkstemp(prefix=_prefix(path), dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -66,10 +68,12 @@ def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Pat
     """Give a temporary folder to fill; it takes the place of ``folder``, if nothing is raised.
 
     The old one becomes ``previous``, or is deleted. They are exchanged in one step where the system can
-    (Linux); elsewhere the old one is moved first.
+    (Linux); elsewhere the old one is moved first. A link stays, and what it leads to is replaced.
     """
+    folder = _linked(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))
+    with _naming(folder):
+        temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))
     aside = temporary.with_name(f"{temporary.name}-old") if previous is None else previous
     try:
         yield temporary
@@ -153,6 +157,20 @@ def measured(file: Path) -> tuple[int, int]:
             size += len(piece)
             checksum = zlib.crc32(piece, checksum)
     return size, checksum
+
+
+def _linked(path: Path) -> Path:
+    """What a link leads to, even where nothing is there yet; any other path as it is."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Have errors of the system name this path instead of the temporary one beside it."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _prefix(path: Path) -> str:

@@ -111,7 +111,8 @@ def locked(run: Path) -> Iterator[None]:
         run.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except (Timeout, FileNotFoundError, FileExistsError) as error:  # the last two: it has just gone again
-        if run.is_file():
+        broken = run.is_symlink() and not run.exists()
+        if run.is_file() or broken or not run.parent.is_dir():
             raise
         raise ValueError(f"{run} is being written by another process: wait for it, or end it") from error
     try:
