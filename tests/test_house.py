@@ -18,8 +18,8 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (7_415, 32),
     "evaluation": (7_425, 36),  # public functions name their errors
-    "report": (4_050, 25),  # one process writes to a folder of images
-    "cli": (2_325, 32),  # errors of the system with what to do
+    "report": (4_110, 25),  # one image as a single file
+    "cli": (2_335, 32),  # one image as a single file
     "training": (3_485, 17),  # CUDA graphs
     "baselines": (2_485, 11),
     "render": (1_690, 15),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_680, 246)  # on the way to (37_000, 270)
-TEST_LINES = 25_930
+TOTAL = (39_755, 246)  # on the way to (37_000, 270)
+TEST_LINES = 25_965
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

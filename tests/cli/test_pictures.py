@@ -243,6 +243,36 @@ def test_the_whole_photograph_is_written_unless_the_frame_is_asked_for(tiny, pho
         assert frame.size == (48, 48)
 
 
+def test_one_image_is_written_as_a_single_file(tiny, photos, tmp_path, refused):
+    """The file has the bytes or pixels of the folder's: last still, film, panel or mesh."""
+    one, fast = photos / "0.png", ["-m", tiny, "--size", 32, "--fit-steps", 0]
+    words = ["relight", one, *fast, "--reach", 50, "--frames", 4]
+    assert run(*words, "-o", tmp_path / "all") == 0
+    made = tmp_path / "all" / "0"
+    for name in ("lit.png", "lit.jpg", "lit.gif", "back.png"):
+        more = ["--reach", -50] if name == "back.png" else []
+        assert run(*words, *more, "-o", tmp_path / "single" / name) == 0
+    stills = [np.asarray(Image.open(made / f"still-{number:02d}.png")) for number in (1, 7)]
+    single = {file.name: file for file in (tmp_path / "single").iterdir()}
+    assert len(single) == 4  # and nothing beside them
+    for name, still in (("lit.png", stills[1]), ("back.png", stills[0])):
+        np.testing.assert_array_equal(np.asarray(Image.open(single[name])), still)
+    with Image.open(single["lit.jpg"]) as lit:
+        assert lit.format == "JPEG" and lit.mode == "RGB"
+    assert single["lit.gif"].read_bytes() == (made / "film.gif").read_bytes()
+    assert run("mesh", one, *fast, "-o", tmp_path / "one.glb") == 0
+    assert (tmp_path / "one.glb").read_bytes()[:4] == b"glTF"
+    assert run("decompose", one, *fast, "-o", tmp_path / "panel.png") == 0
+    before = (tmp_path / "panel.png").read_bytes()
+    again = ("decompose", one, *fast, "-o", tmp_path / "panel.png")
+    assert "exists already" in refused(*again)
+    assert run(*again, "--resume") == 0 and (tmp_path / "panel.png").read_bytes() == before
+    assert "no single .mp4 is made here, but .png" in refused(*again[:-1], tmp_path / "x.mp4")
+    assert "there are 6 images" in refused("mesh", photos, *fast, "-o", tmp_path / "x.glb")
+    assert "add --factor" in refused("swap", one, *fast, "--from", one, "-o", tmp_path / "x.png")
+    assert not list(tmp_path.glob("x.*"))
+
+
 def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
     one, out = photos / "0.png", tmp_path / "out"
     given = ("-m", tiny, one, "-o", out)
@@ -251,7 +281,7 @@ def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
     assert "none.png does not exist" in refused("relight", *given, "--like", tmp_path / "none.png")
     assert "holds no images" in refused("rotate", "-m", tiny, tmp_path, "-o", out)
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
-    assert "reach must be above 0" in refused("relight", *given, "--reach", "0")
+    assert "reach must not be 0" in refused("relight", *given, "--reach", "0")
     assert "size 16 is below the model's: give --size 32 or more" in refused(
         "relight", *given, "--size", "16"
     )
@@ -259,7 +289,9 @@ def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
     assert "unknown format 'gbl'; did you mean 'glb'" in refused("mesh", *given, "--format", "gbl")
     assert "unknown kind of film 'avi'" in refused("rotate", *given, "--film", "avi")
     assert not out.exists()
-    assert "is a file: name a folder to write to" in refused("mesh", "-m", tiny, one, "-o", one)
+    assert "is the image itself" in refused("decompose", "-m", tiny, one, "-o", one, "--force")
+    (notes := tmp_path / "notes").touch()
+    assert "is a file: name a folder to write to" in refused("mesh", "-m", tiny, one, "-o", notes)
     (out / "0").mkdir(parents=True)
     assert "exists already: choose another --out, or add --force" in refused("mesh", *given)
     assert list((out / "0").iterdir()) == []

@@ -14,7 +14,7 @@ FACTOR = "Factor to take; may be repeated. By default each in turn."
 def relight(
     files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
     like: Path | None = option(None, "Go to the lighting of this image.", metavar="IMAGE"),
-    reach: float = option(60.0, "Reach of the light to either side, in degrees."),
+    reach: float = option(60.0, "Reach to either side, in degrees; a single file shows the light there."),
     pitch: float = option(10.0, "Height of the light, in degrees."),
     strength: float = option(1.0, "Strength in multiples of the image's own.", min=0, max=10),
 ) -> None:  # fmt: skip
@@ -29,22 +29,24 @@ def relight(
     others = [] if like is None else [opener.open(like)]
     moves: dict[str, Any] = {"reach_deg": reach, "pitch_deg": pitch, "strength": strength}
     moves["like"] = others[0] if others else None
-    edit, video = partial(relit, opener.model, **moves, film=film), relit_video(**moves, hold=film.hold)
+    edit = partial(relit, opener.model, **moves, film=film.single(files.suffix))
+    video = relit_video(**moves, hold=film.hold)
     files.edit(opener, edit, output, beside=others, video=video)
 
 
 @command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")
 def rotate(
     files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
-    reach: float = option(40.0, "Rotation of the object to either side, in degrees."),
+    reach: float = option(40.0, "Rotation to either side, in degrees; a single file shows it."),
     pitch: float = option(0.0, "Nod in degrees: the top comes forward."),
 ) -> None:  # fmt: skip
     """Write strips and films of images rotated from one side to the other, in their own lighting."""
     from derender.report.edits import rotated, rotated_video
 
     opener = opener_of(model, how, EDIT_SIZE, whole=True)
-    edit = partial(rotated, opener.model, reach_deg=reach, pitch_deg=pitch, film=film)
-    files.edit(opener, edit, output, video=rotated_video(reach_deg=reach, pitch_deg=pitch, hold=film.hold))
+    moves = {"reach_deg": reach, "pitch_deg": pitch}
+    edit = partial(rotated, opener.model, **moves, film=film.single(files.suffix))
+    files.edit(opener, edit, output, video=rotated_video(**moves, hold=film.hold))
 
 
 @command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")
@@ -60,6 +62,8 @@ def swap(
 
     opener = opener_of(model, how, EDIT_SIZE, whole=True)
     parameters = swappable(opener.model, factor or ())
+    if files.suffix and len(parameters) > 1:
+        raise ValueError(f"{files.out} is a single file, which shows one factor: add --factor NAME")
     donor = opener.open(source)
     edit = partial(swapped_factors, opener.model, donor=donor, factors=list(parameters))
     moving = any(is_video(path) for path in image_files(files.images, files.out))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from derender.cli.console import notice, progress_bar, report_images, result, write_json
-from derender.report.options import ImageOptions, option
+from derender.report.options import ImageOptions, option, single_suffix
 from derender.storage.places import (
     DEVICES,
     bundled_models,
@@ -44,6 +44,7 @@ BATCH = "Images per batch; changes speed and memory only."
 PART = "all, or the train, validation or test part of the model's training split."
 SEED = "Seed of every random choice: sampling, splits, initial weights."
 FIT = "Optimise each scene against its image by rendering, in N steps (20, say; slow)."
+OUT_IMAGES = "Folder to write to; or, of one image, a single .png, .jpg, .gif, .mp4 or .glb."
 SETTING = "Change one setting; may be repeated. The reference of settings lists all."
 Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
 Images = Annotated[str | None, typer.Argument(help=IMAGES, metavar="IMAGES", show_default=False)]
@@ -54,6 +55,7 @@ BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help=SEED)]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
+OutImages = Annotated[Path, typer.Option("--out", "-o", help=OUT_IMAGES, metavar="DIR|FILE")]
 OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder of the new model.", metavar="DIR")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", metavar="NAME")]
 FitSteps = Annotated[int | None, typer.Option("--fit-steps", min=0, max=10_000, metavar="N", help=FIT)]
@@ -229,11 +231,16 @@ class ImageFiles:
     images: Annotated[
         list[Path], typer.Argument(help="Image files, videos, or folders of them.", metavar="IMAGE...")
     ]
-    out: OutFolder
+    out: OutImages
     resume: bool = option(False, "Leave out images that are done.", "--resume")
 
     def __post_init__(self) -> None:
         require_image(self.images)
+
+    @property
+    def suffix(self) -> str:
+        """Of ``--out`` where it names one file; else empty."""
+        return single_suffix(self.out)
 
     def edit(
         self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: Output, **how: Any
@@ -242,12 +249,13 @@ class ImageFiles:
 
         ``how`` are further keywords of ``write_images``.
         """
-        from derender.report.editing import write_images
+        from derender.report.editing import write_image_file, write_images
 
+        write = write_image_file if self.suffix else write_images
         how |= {"force": output.force, "resume": self.resume}
         with progress_bar("drawing", "images") as report:
             try:
-                written = write_images(opener, self.images, self.out, edit, **how, progress=report)
+                written = write(opener, self.images, self.out, edit, **how, progress=report)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt(
                     "stopped by Ctrl-C; what is done is kept: --resume continues"

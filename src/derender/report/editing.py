@@ -8,10 +8,11 @@ read is left out and listed; the others are written. Leaves out opening (``openi
 
 import json
 import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,6 +23,7 @@ from derender.photo import edit_video, is_video
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
+from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
 from derender.storage.atomic import atomic_file, atomic_folder
 from derender.storage.places import counted
@@ -196,6 +198,51 @@ def write_images(
         odd = unlike(np.stack([one.pixels for one in every]), [one.percentile or 0 for one in every])
     before = len(places) - len(records) - len(refused)
     return WrittenImages(out, records, files, refused, percentiles, framing, odd, before)
+
+
+def write_image_file(
+    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
+    force: bool = False, resume: bool = False, **how: Any,
+) -> WrittenImages:  # fmt: skip
+    """Edit one image, and write a single file of that: the last still, a film, a panel or a mesh.
+
+    ``out`` names the file, its suffix the kind; other arguments and errors as for ``write_images``.
+
+    Raises:
+        ValueError: there are several images, or the edit makes no such file.
+    """
+    image, *more = image_files(paths, out)
+    if more:
+        raise ValueError(f"{out} is a single file, and there are {1 + len(more):,} images: name a folder")
+    if out.resolve() == image.resolve():
+        raise ValueError(f"{out} is the image itself: name another file as --out")
+    if out.exists() and resume:
+        return WrittenImages(out, [], [], {}, {}, before=1)
+    if out.exists() and not force:
+        raise FileExistsError(f"{out} exists already: choose another --out, or add --force to replace it")
+    with tempfile.TemporaryDirectory() as folder, atomic_file(out) as temporary:
+        written = write_images(opener, [image], Path(folder) / "images", edit, **{**how, "sheet": False})
+        record = written.images[0]
+        _copy_single(Path(record["folder"]), temporary, out)
+    elsewhere = ("folder", "files", "stills", "out")  # of the record: files that are gone
+    record = {name: value for name, value in record.items() if name not in elsewhere}
+    return replace(written, out=out, images=[{**record, "file": str(out)}])
+
+
+def _copy_single(folder: Path, temporary: Path, out: Path) -> None:
+    """Copy the one of an image's files that ``out`` asks for by its suffix."""
+    suffix = out.suffix.lower()
+    names = ("panel.png", "still-*.png") if suffix in STILL_SUFFIXES else (f"film{suffix}", f"*{suffix}")
+    files = [file for name in names for file in sorted(folder.glob(name))]
+    if not files or suffix == ".obj":
+        kinds = sorted({file.suffix for file in folder.iterdir()} & {".png", ".gif", ".mp4", ".glb"})
+        raise ValueError(f"{out}: no single {suffix} is made here, but {' or '.join(kinds) or 'a folder'}")
+    if suffix in STILL_SUFFIXES:
+        kind = Image.registered_extensions()[suffix]
+        with Image.open(files[-1]) as still:
+            (still.convert("RGB") if kind == "JPEG" else still).save(temporary, format=kind, quality=95)
+    else:
+        shutil.copyfile(files[0], temporary)
 
 
 @contextmanager

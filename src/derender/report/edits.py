@@ -224,7 +224,7 @@ def _inputs(model: Derenderer, image: OpenedImage, other: OpenedImage | None) ->
 
 def _angle_text(reach_deg: float, stills: int) -> Callable[[float], str]:
     """How angles of a sweep are written: with as many decimals as distinguish its stills."""
-    if reach_deg <= 0:
-        raise ValueError(f"reach must be above 0 degrees, got {reach_deg:g}")
-    decimals = max(0, ceil(-log10(2 * reach_deg / (stills - 1))))
+    if not reach_deg:
+        raise ValueError("reach must not be 0 degrees")
+    decimals = max(0, ceil(-log10(2 * abs(reach_deg) / (stills - 1))))
     return lambda angle_deg: re.sub(r"^[+-](?=[0.]*°)", "", f"{angle_deg:+.{decimals}f}°")  # 0 has no sign

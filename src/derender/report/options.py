@@ -4,7 +4,8 @@ Each field is an option of every command that takes the class (``cli/options.py`
 here: the command line needs these classes for its help.
 """
 
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from derender.storage.places import require_known
@@ -13,8 +14,16 @@ CHOICES = {"detail": ("photo", "model"), "frame": ("face", "auto", "none")}
 OLD_TEXTURES = {"original": "photo", "model": "model"}
 OLD_CROPS = {"whole": "none", "auto": "auto"}
 FILM_KINDS, MESH_FORMATS = ("gif", "mp4"), ("glb", "obj")
+STILL_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 EDIT_SIZE, WHOLE_SIZE, MESH_SIZE, TEXTURE_SIZE = 384, 1024, 128, 1024
 """Default sides in pixels: of edits, of whole photographs at most, of a mesh's grid and texture."""
+
+
+def single_suffix(out: Path) -> str:
+    """The suffix by which ``out`` asks for one file, in lower case; empty where it is a folder."""
+    suffix = out.suffix.lower()
+    known = (*STILL_SUFFIXES, *(f".{kind}" for kind in (*FILM_KINDS, *MESH_FORMATS)))
+    return suffix if suffix in known and not out.is_dir() else ""
 
 
 def option(default: Any, help: str | None, *names: str, **shown: Any) -> Any:
@@ -91,3 +100,9 @@ class FilmOptions:
         """The kinds of film by name; none for "none"."""
         kinds = tuple(dict.fromkeys(kind.strip().lower() for kind in self.film.split(",")))
         return () if kinds == ("none",) else kinds
+
+    def single(self, suffix: str) -> "FilmOptions":
+        """The same, but no more than a file of that suffix shows (``single_suffix``)."""
+        if suffix in STILL_SUFFIXES:
+            return replace(self, film="none", stills=2)
+        return replace(self, film=suffix[1:]) if suffix[1:] in FILM_KINDS else self
