@@ -5,7 +5,7 @@ objects. `small` has a quarter of the widths (a sixteenth of the work) and train
 trained is in training/config.py under the same names.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 from pydantic import Field
@@ -32,14 +32,14 @@ class ModelSettings(Settings):
         sizes = {"image_size": image_size, "grown_from": self.network.encoded_size}
         return self.model_copy(update={"network": NetworkSettings(**{**self.network.model_dump(), **sizes})})
 
-    def description(self) -> str:
-        """Two sentences for a model's card: what such a model does, its sizes and ranges."""
+    def description(self, factors: Sequence[str]) -> str:
+        """Two sentences for a model's card: factors and renderer; sizes and ranges."""
         network, ranges = self.network, self.ranges
         return (
             f"Decomposes {network.image_size} x {network.image_size} images of one kind of object into "
-            f"geometry, albedo, light and camera. Field of view {ranges.fov_deg:g} degrees; depth "
-            f"{ranges.depth_min:g} to {ranges.depth_max:g}; networks of width {network.width} and "
-            f"{network.light_width}; codes of {network.code_size}."
+            f"{', '.join(factors[:-1])} and {factors[-1]}, drawn by the renderer `{self.renderer}`. "
+            f"Field of view {ranges.fov_deg:g} degrees; depth {ranges.depth_min:g} to {ranges.depth_max:g}; "
+            f"networks of width {network.width} and {network.light_width}; codes of {network.code_size}."
         )
 
 

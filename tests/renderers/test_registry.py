@@ -83,11 +83,12 @@ def test_a_users_module_is_imported_except_for_a_downloaded_model(tmp_path, monk
     (tmp_path / "my_glow.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     name = "my_glow:GLOW"
-    folder = Derenderer.from_preset("small", seed=0, renderer=name, **TINY).save(tmp_path / "m")
-    assert load(folder).renderer.gamma == 2.0
+    folder = Derenderer.from_preset("small", seed=0, renderer=name, **TINY).save_pretrained(tmp_path / "m")
+    assert f"light and camera, drawn by the renderer `{name}`." in (folder / "README.md").read_text()
     with pytest.raises(ValueError, match=r"someone/model was downloaded and wants the code .*my_glow:GLOW"):
         recorded_renderer(name, None, "someone/model")
-    assert recorded_renderer(name, name, "someone/model").gamma == 2.0
+    for given in (name, Renderer("glow", gamma=2.0)):
+        assert recorded_renderer(name, given, "someone/model") == load(folder).renderer
 
 
 @pytest.mark.parametrize("line", ["raise RuntimeError('no')", "import sys; sys.exit(3)", "1 / 0", "def"])

@@ -19,7 +19,7 @@ from derender.render import Rendering
 from derender.renderers.renderer import FunctionRenderer, Renderer
 from derender.scene import Scene
 from derender.storage.bounded import parse_yaml
-from derender.storage.places import bundled_models, bundled_renderers
+from derender.storage.places import bundled_renderers
 
 __all__ = [
     "RENDERERS", "Render", "Renderer", "as_renderer", "brings_code", "recorded_renderer", "renderer_named",
@@ -66,14 +66,15 @@ def recorded_renderer(stored: str, given: str | Render | None, source: str | Pat
 
     A ValueError: it was made with another renderer, or was downloaded and wants a user's module imported.
     """
-    downloaded = not Path(source).exists() and source not in bundled_models()
+    if isinstance(given, Renderer) and brings_code(stored) and given.name.partition("(")[0] not in RENDERERS:
+        return replace(given, name=stored)  # a user's own value, which knows no module
     asked = given.name if isinstance(given, Renderer) else given
     if isinstance(asked, str) and asked != stored:
         raise ValueError(
             f"{source} was made with the renderer {stored!r}, not {asked!r}: leave the renderer out, or "
             "train a model with it"
         )
-    if downloaded and brings_code(stored) and given is None:
+    if brings_code(stored) and given is None and not Path(source).exists():  # of no bundled model either
         raise ValueError(
             f"{source} was downloaded and wants the code of the renderer {stored!r}: if you trust that code, "
             f"use derender.load({str(source)!r}, renderer={stored!r})"

@@ -27,6 +27,7 @@ class Shareable:
     """Saving, for a model that can write its own files; ``source`` is the folder its weights come from."""
 
     settings: Any
+    factors: Any
     source: Path | None = None
 
     @abstractmethod
@@ -88,15 +89,14 @@ class Shareable:
         if CARD_FILE in beside and not any(stated):
             return beside[CARD_FILE]
         data, licence, scores = stated
+        renderer = self.settings.renderer
+        own = f', renderer="{renderer}"' if ":" in renderer else ""  # a user's module: where it is named only
         measured = " ".join(filter(None, [scores, _errors_in_words(beside.get(ERRORS_FILE, ""))]))
         parts = {"Trained on": data, "Scores": measured, "Licence": licence}
-        paragraphs = [
-            f"# {title}",
-            self.settings.description(),
-            f'```python\nimport derender\n\nmodel = derender.load("{title}")\n```',
-            *(f"**{name}**: {text or 'not stated'}" for name, text in parts.items()),
-        ]
-        return "\n\n".join(paragraphs) + "\n"
+        does = self.settings.description([row.name for row in self.factors])
+        code = f'```python\nimport derender\n\nmodel = derender.load("{title}"{own})\n```'
+        lines = (f"**{name}**: {text or 'not stated'}" for name, text in parts.items())
+        return "\n\n".join([f"# {title}", does, code, *lines]) + "\n"
 
 
 def upload(folder: Path, repository: str, *, private: bool, token: str | None) -> str:

@@ -4,7 +4,7 @@
 const $ = (id) => document.getElementById(id);
 const NAMES = {
   input: "the crop as the model sees it",
-  reconstruction: "rendered from the four factors",
+  reconstruction: "rendered from all factors",
   depth: "bright is near, dark is far",
   normals: "red to the right, green up, blue to the viewer",
   albedo: "colour without lighting",
