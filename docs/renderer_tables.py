@@ -30,19 +30,20 @@ def renderers_trained(result: Any) -> Iterator[list[str]]:
     yield [
         "effect, renderer",
         *("normals, degrees", "of lambert"),
-        *("albedo error / lambert's", "the same without the effect"),
+        *("albedo error / lambert's", "the same without the effect", "lambert's with / without the effect"),
     ]
     groups = _trained(result)
     for effect, name in [pair for pair in groups if "lambert" not in pair[1:] and pair[0] != "none"]:
         normals = (spread([one["normal_deg"] for one in groups[effect, own]], 1) for own in (name, "lambert"))
-        ratios = (spread(_over_lambert(groups, images, name), 2) for images in (effect, "none"))
-        yield [f"{effect}: {name}", *normals, *ratios]
+        plain, hit = ("none", "lambert"), (effect, "lambert")
+        pairs = (((effect, name), hit), (("none", name), plain), (hit, plain))
+        yield [f"{effect}: {name}", *normals, *(spread(_ratios(groups, *pair), 2) for pair in pairs)]
 
 
-def _over_lambert(groups: Any, effect: str, name: str) -> list[float]:
-    """The albedo error of a renderer over that of ``lambert`` on the same images, for each seed."""
-    plain = {one["seed"]: one["albedo"] for one in groups[effect, "lambert"]}
-    return [one["albedo"] / plain[one["seed"]] for one in groups[effect, name]]
+def _ratios(groups: Any, upper: tuple[str, str], lower: tuple[str, str]) -> list[float]:
+    """The albedo error of one effect and renderer over that of another, for each seed."""
+    errors = {one["seed"]: one["albedo"] for one in groups[lower]}
+    return [one["albedo"] / errors[one["seed"]] for one in groups[upper]]
 
 
 def _trained(result: Any) -> dict[tuple[str, str], list[Any]]:
