@@ -3,7 +3,7 @@
 
 const $ = (id) => document.getElementById(id);
 const NAMES = {
-  input: "the crop as the model sees it",
+  input: "the crop that the model receives",
   reconstruction: "rendered from the four factors",
   depth: "bright is near, dark is far",
   normals: "red to the right, green up, blue to the viewer",
