@@ -8,7 +8,7 @@ import inspect
 import re
 import tokenize
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import StringIO
 from typing import Any
 
@@ -35,6 +35,9 @@ def all_commands(group: Any = None, before: str = "derender") -> Iterator[tuple[
             yield full, command
 
 
+Options = dict[str, tuple[str, str, str]]
+"""Of one command: all names, meaning and default by first name."""
+
 SHARED = 4
 """An option that means the same in so many commands is explained once, above them."""
 
@@ -42,12 +45,15 @@ SHARED = 4
 def command_pages() -> Iterator[str]:
     """Shared options, then for each command: what it does, its usage, an example, its own options."""
     rows = {name: dict(map(option_row, shown(command))) for name, command in all_commands()}
-    count = Counter(row for one in rows.values() for row in one.items())
-    shared: dict[str, str] = {}
-    for (row, text), times in count.most_common():
+    count = Counter((option, *row[:2]) for one in rows.values() for option, row in one.items())
+    shared: dict[str, tuple[str, str]] = {}
+    for (option, *row), times in count.most_common():
         if times >= SHARED:
-            shared.setdefault(row, text)
-    yield from ("## Shared options\n", HEAD, *shared.values(), "")
+            shared.setdefault(option, (row[0], row[1]))
+    defaults = {option: usual_default(option, row, rows.values()) for option, row in shared.items()}
+    yield from ("## Shared options\n", HEAD)
+    yield from (f"| {names} | {text} | {defaults[option]} |" for option, (names, text) in shared.items())
+    yield ""
     for name, command in all_commands():
         yield f"## {name}\n\n{clean(command.help or '')}\n"
         arguments = " ".join(
@@ -55,10 +61,20 @@ def command_pages() -> Iterator[str]:
         )
         example = re.sub(r"^Example: ", "", command.epilog or "")
         yield f"```sh\n{name} {arguments} [OPTIONS]\n{f'{example}   # example' if example else ''}\n```\n"
-        own = [text for row, text in rows[name].items() if shared.get(row) != text]
-        yield from (HEAD, *own, "") if own else ()
-        others = [row for row, text in rows[name].items() if shared.get(row) == text]
-        yield f"Shared: {', '.join(f'`{row}`' for row in others)}.\n" if others else ""
+        own = [row for option, row in rows[name].items() if shared.get(option) != row[:2]]
+        yield from (HEAD, *(f"| {' | '.join(row)} |" for row in own), "") if own else ()
+        others = [
+            f"`{option}`" + (f" (default {row[2] or 'none'})" if row[2] != defaults[option] else "")
+            for option, row in rows[name].items()
+            if shared.get(option) == row[:2]
+        ]
+        yield f"Shared: {', '.join(others)}.\n" if others else ""
+
+
+def usual_default(option: str, row: tuple[str, str], commands: Iterable[Options]) -> str:
+    """The default that most commands give an option of these names and this meaning."""
+    same = [one[option][2] for one in commands if option in one and one[option][:2] == row]
+    return Counter(same).most_common(1)[0][0]
 
 
 HEAD = "| option | meaning | default |\n| --- | --- | --- |"
@@ -69,14 +85,14 @@ def shown(command: Any) -> list[Any]:
     return [one for one in command.params if not getattr(one, "hidden", False) and one.name != "help"]
 
 
-def option_row(one: Any) -> tuple[str, str]:
-    """An option's first name, and its row."""
+def option_row(one: Any) -> tuple[str, tuple[str, str, str]]:
+    """An option's first name, and its row: all names, meaning, default."""
     option = one.param_type_name == "option"
     names = ", ".join(one.opts + one.secondary_opts) if option else one.metavar or one.name.upper()
     default = one.default() if callable(one.default) else one.default
     empty = default is None or default is False or default == ()
-    text = f"| `{names}` | {clean(one.help or '')} | {'' if empty else f'`{default}`'} |"
-    return (one.opts[0] if option else names), text
+    row = f"`{names}`", clean(one.help or ""), "" if empty else f"`{default}`"
+    return (one.opts[0] if option else names), row
 
 
 def clean(text: str) -> str:

@@ -56,7 +56,7 @@ SUMMARY = (
         "nothing",
     ),
     (
-        "12 generated people, unseen light and view",
+        "12 generated people, unseen light and view, 20 steps",
         "{people|geometry + albedo|generated people}",
         "HOG with mirror image {people|HOG with mirror image (control)|generated people}",
         "nothing",
@@ -275,7 +275,8 @@ def framings(result: Any) -> Iterator[list[str]]:
     yield ["features of one image", "cosine, mean", "lowest pair, mean", "two people"]
     for name, row in result["framings"].items():
         keys = ("cosine_mean", "cosine_lowest_mean", "cosine_of_two_people")
-        yield [name, *(f"{row[key]:.3f}" for key in keys)]
+        sets, _, option = name.partition(", ")
+        yield [f"{sets}, `{option}`", *(f"{row[key]:.3f}" for key in keys)]
 
 
 def angles(_: Any) -> Iterator[list[str]]:

@@ -1,12 +1,12 @@
-"""The pictures of the site that models made: docs/images/gallery, made anew by one command.
+"""The pictures of the site but portraits and conventions: docs/images/gallery, made anew by one command.
 
     .venv/bin/python examples/gallery.py                             # test heads of the generated benchmark
     .venv/bin/python examples/gallery.py --data heads.zip::test      # a rendered set with true maps
     .venv/bin/python examples/gallery.py --only swap                 # one picture
 
 Every picture is evenly spaced through its data and none is chosen. Only rendered or generated data belongs
-here: show no image of a real person. Look at the pictures before you commit them. `faces-128` draws generated
-heads no better than these models, and its edits in a photograph's own pixels look like those of `faces-64`.
+here: show no image of a real person. Look at the pictures before you commit them. Edits in a photograph's own
+pixels look the same with `faces-64` and `faces-128`.
 """
 
 import argparse
@@ -23,6 +23,9 @@ from portraits import portraits
 import derender
 from derender.cli import main as command
 from derender.data import as_float, read_ground_truth
+from derender.data.synthetic import PARTS, cars, faces, write_generated
+from derender.data.synthetic.settings import CLASSES, LIGHTS, VIEWS, CarSettings, FaceSettings, named_settings
+from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.evaluation.depth import predicted_depth
 from derender.photo import open_photograph
 from derender.report import colours
@@ -30,7 +33,8 @@ from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 from derender.scene.normals import normals_from_depth
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "images" / "gallery"
-CELL, FACES, SEARCHED = 192, 4, 400
+CELL, FACES, SEARCHED, ACROSS = 192, 4, 400, 6
+MODEL, SIZE = "rendered-faces-128", 128
 
 
 def run(*words: object) -> None:
@@ -62,8 +66,8 @@ def side(yaw_deg: float) -> str:
 
 
 def decompose(data: str, work: Path) -> None:
-    """Predicted maps of `rendered-faces-64` beside the true ones, in the view of the image."""
-    model, truth = derender.load("rendered-faces-64"), read_ground_truth(data, image_size=64)
+    """Predicted maps of `rendered-faces-128` beside the true ones, in the view of the image."""
+    model, truth = derender.load(MODEL), read_ground_truth(data, image_size=SIZE)
     rows = np.linspace(0, len(truth) - 1, FACES).round().astype(int)
     heads = [f"{n}: light {side(yaw)}" for n, yaw in enumerate(np.degrees(truth.light[rows, 3]), 1)]
     images, mask = truth.images[rows], truth.mask[rows]
@@ -105,7 +109,7 @@ def swap(data: str, work: Path) -> None:
 
 def search(data: str, work: Path) -> None:
     """The nearest by geometry and by lighting, of one image, with their true angle of light."""
-    truth, model = read_ground_truth(data, image_size=64), derender.load("rendered-faces-64")
+    truth, model = read_ground_truth(data, image_size=SIZE), derender.load(MODEL)
     table, pixels = derender.embed(data, model, fit_steps=0), colours.pictures(truth.images)
     for factor in ("geometry", "light"):
         query = len(truth) // 2
@@ -126,7 +130,37 @@ def explain(data: str, work: Path) -> None:
     keep(work / "why" / "shares.png", "explain.png", 1100)
 
 
-PICTURES = {"decompose": decompose, "swap": swap, "search": search, "explain": explain}
+def generated(data: str, work: Path) -> None:
+    """Twelve generated people, and cars; one of each under other lighting and views; its true maps."""
+    wide = FaceSettings(light=LIGHTS["wide"], view=VIEWS["wide"], pictures_per_identity=ACROSS)
+    people = faces.generate(2 * ACROSS, CELL, seed=1, settings=FaceSettings(pictures_per_identity=1))
+    keep(
+        tiles(people, people.images, faces.generate(ACROSS, CELL, seed=2, settings=wide).images), "faces.webp"
+    )
+    each = [CarSettings(classes={name: 1.0}) for name in CLASSES]
+    classes = [cars.generate(1, CELL, seed=1, settings=one).images for one in each[: 2 * ACROSS]]
+    turned = cars.generate(ACROSS, CELL, seed=2, settings=CarSettings(pictures_per_model=ACROSS))
+    keep(tiles(turned, *classes, turned.images), "cars.webp")
+
+
+def tiles(truth: SyntheticSet, *images: np.ndarray) -> Image.Image:
+    """Tiles of these images, and a row of one set's first: image, albedo, depth, normals, mask and parts."""
+    first, mask = slice(1), truth.mask[:1]
+    hue = truth.parts[first, :, :, None] * 2.4 + np.array([0, 2.1, 4.2])  # far apart for neighbouring numbers
+    cells = [cell for some in images for cell in colours.pictures(some)]
+    cells += colours.pictures(truth.images[first]) + colours.pictures(truth.albedo[first], mask)
+    cells += colours.depth_maps(truth.depth[first], mask) + colours.normal_maps(truth.normal[first], mask)
+    cells += colours.level_maps(mask) + colours.pictures(np.moveaxis(0.5 + 0.45 * np.cos(hue), -1, 1), mask)
+    drawn = Image.new("RGB", (ACROSS * CELL, len(cells) // ACROSS * CELL), "white")
+    for number, cell in enumerate(cells):
+        corner = number % ACROSS * CELL, number // ACROSS * CELL
+        drawn.paste(colours.on_background(cell), corner)
+    return drawn
+
+
+PICTURES = {
+    "decompose": decompose, "swap": swap, "search": search, "explain": explain, "generated": generated,
+}  # fmt: skip
 
 
 def main() -> None:
@@ -138,7 +172,9 @@ def main() -> None:
         work = Path(folder)
         data = given.data or str(work / "made" / "test")
         if given.data is None:
-            run("synth", "faces", "--benchmark", "--out", work / "made")
+            part = PARTS["faces"]["test"]
+            chosen = named_settings(FaceSettings, part.ranges, part.ranges, part.overrides)
+            write_generated("faces", Path(data), part.count, SIZE, part.seed, chosen, part.truth)
         for name in given.only or PICTURES:
             PICTURES[name](data, work)
             print(name)

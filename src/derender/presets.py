@@ -1,8 +1,8 @@
 """Models by name: one row each.
 
-`paper` is the paper's model. `faces`, `cats` and `cars` are the same networks with ranges that suit such
-objects. `small` has a quarter of the widths (a sixteenth of the work) and trains on a CPU. How each is
-trained is in training/config.py under the same names.
+`paper` is the paper's model; `faces` and `cats` are the same, as unsup3d's ranges for them are. `cars` has
+ranges for cars. `small` has a quarter of the widths (a sixteenth of the work) and trains on a CPU. How each
+is trained is in training/config.py under the same names.
 """
 
 from collections.abc import Mapping, Sequence

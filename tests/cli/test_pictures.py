@@ -186,7 +186,7 @@ def test_a_folder_goes_on_where_it_was_stopped(tiny, photos, tmp_path, numbers, 
     with monkeypatch.context() as stop:
         stop.setattr(Edit, "write", interrupted)
         assert run(*words) == 130
-    assert "what is done is kept: --resume continues" in capsys.readouterr().err
+    assert "finished images are kept: --resume continues" in capsys.readouterr().err
     assert not (out / "sheet.png").exists() and len(list(out.glob("[0-9]"))) == 3
     numbers(*words, "--resume")
     assert (out / "sheet.png").read_bytes() == sheet and not (out / ".sheet").exists()  # with every picture

@@ -42,7 +42,7 @@ def whiten(
     """Write a copy of a model whose features move as little as possible with other factors.
 
     They are estimated on these images, without labels, and so is how albedo and lighting share brightness.
-    Weights and reconstructions stay as they are. Training ends with this by itself. With --set steps=60
+    Weights and reconstructions stay as they are. Training ends with this by itself. With --set steps=20
     features also hold scenes optimised for each image by rendering.
     """
     from derender import learn

@@ -53,7 +53,7 @@ Json = Annotated[str | None, typer.Option("--json", help=JSON, metavar="FILE")]
 Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help=LIMIT)]
 BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help=BATCH)]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help=SEED)]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
 OutImages = Annotated[Path, typer.Option("--out", "-o", help=OUT_IMAGES, metavar="DIR|FILE")]
 OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder of the new model.", metavar="DIR")]
@@ -258,7 +258,7 @@ class ImageFiles:
                 written = write(opener, self.images, self.out, edit, **how, progress=report)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt(
-                    "stopped by Ctrl-C; what is done is kept: --resume continues"
+                    "stopped by Ctrl-C; finished images are kept: --resume continues"
                 ) from None
         for note in written.notes():
             notice(note)

@@ -70,7 +70,7 @@ def report_run(run: "TrainResult") -> None:
     for finding in run.findings:
         notice(f"{finding.sign}: {finding.text}; {finding.advice}")
     if run.stopped == "collapse":
-        notice("training on is pointless: what is left is the last good checkpoint and model, if any")
+        notice("training on is pointless: the last good checkpoint and model are kept, if any")
     waited = f"{run.waiting:.1%} of it waiting for data"
     notice(f"{run.images:,} images in {duration(run.seconds)}, {waited}; stopped by: {run.stopped}")
     if run.stopped != "collapse" and run.model_images not in (None, run.images):

@@ -36,15 +36,15 @@ class NetworkSettings(Settings):
     maps end in further doublings.
     """
 
-    image_size: int = 64
-    grown_from: int | None = None
-    width: int = Field(default=64, ge=4, le=LARGEST, multiple_of=4)
-    light_width: int = Field(default=32, ge=1, le=LARGEST)
-    code_size: int = Field(default=256, ge=1, le=LARGEST)
-    confidence_code_size: int = Field(default=128, ge=1, le=LARGEST)
-    encoder: Literal["conv", "unet"] = "conv"
-    unet_width: int = Field(default=16, ge=1, le=LARGEST)
-    unet_decoder: bool = False
+    image_size: int = 64  # side of square images in pixels
+    grown_from: int | None = None  # side that encoders reduce images to; None: image_size
+    width: int = Field(default=64, ge=4, le=LARGEST, multiple_of=4)  # channels of the first layers
+    light_width: int = Field(default=32, ge=1, le=LARGEST)  # of light's and camera's networks
+    code_size: int = Field(default=256, ge=1, le=LARGEST)  # dimensions of each factor's code
+    confidence_code_size: int = Field(default=128, ge=1, le=LARGEST)  # of the net used in training only
+    encoder: Literal["conv", "unet"] = "conv"  # unet: encoders with maps of every resolution
+    unet_width: int = Field(default=16, ge=1, le=LARGEST)  # first channels of U-Net encoders
+    unet_decoder: bool = False  # with the decoder of derender unet
 
     @field_validator("image_size")
     @classmethod

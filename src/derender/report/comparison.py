@@ -42,5 +42,5 @@ def chart_of(table: ScoreTable) -> Chart | None:
             models = [row.name for row in table.rows if not row.control]
             svg = charts.bars(values, f"{column.name} ({DIRECTIONS[column.best]})", models)
             alt = f"{column.name} of {', '.join(f'{name} {column.text(v)}' for name, v in values.items())}"
-            return svg, alt, f"{column.name}; what learned nothing is grey."
+            return svg, alt, f"{column.name}; controls are grey."
     return None

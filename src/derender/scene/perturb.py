@@ -22,8 +22,8 @@ from derender.settings import Settings
 class PerturbSettings(Settings):
     """Largest change of each perturbed number; the bounds of the result are those of `SceneRanges`."""
 
-    ambient: float = Field(default=0.5, ge=0)
-    diffuse: float = Field(default=0.5, ge=0)
+    ambient: float = Field(default=0.5, ge=0)  # largest change of ambient light
+    diffuse: float = Field(default=0.5, ge=0)  # largest change of directional light
     light_deg: float = Field(default=45.0, ge=0)  # pitch and yaw of the light
     camera_pitch_deg: float = Field(default=22.5, ge=0)  # rotation about x
     camera_yaw_deg: float = Field(default=45.0, ge=0)  # rotation about y

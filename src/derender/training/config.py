@@ -43,20 +43,20 @@ def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
 class ObjectiveSettings(Settings):
     """The loss: reconstruction of the image by a scene and by its flipped twin, plus LOOCC."""
 
-    flip_weight: float = Field(default=0.5, ge=0)
-    confidence: bool = True
-    perceptual: Literal["vgg16", "self", "none"] = "self"
-    perceptual_weight: float = Field(default=1.0, ge=0)
+    flip_weight: float = Field(default=0.5, ge=0)  # of the reconstruction from mirrored maps
+    confidence: bool = True  # predict the error of each pixel (sigma)
+    perceptual: Literal["vgg16", "self", "none"] = "self"  # features: VGG16's, learned on the images, or none
+    perceptual_weight: float = Field(default=1.0, ge=0)  # of the loss on features of the images
     smoothness_weight: float = Field(default=0.0, ge=0)  # on steps of depth, as unsup3d for cars
     curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; 0 in the paper
     photometric_weight: float = Field(default=1.0, gt=0)  # without confidence 2 is unsup3d's L1 in -1..1
     perceptual_rescaled: bool = True  # VGG16's features by their standard deviation; not in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps
-    self_features_steps: int = Field(default=600, ge=1)
+    self_features_steps: int = Field(default=600, ge=1)  # steps in which features are learned
     loocc: str = "none"  # factors that are perturbed, joined by +; or all
     loocc_joint: bool = False  # Eq. 6: one code of all factors side by side, instead of factor by factor
-    loocc_weight: float = Field(default=0.01, ge=0)
-    loocc_temperature: float = Field(default=0.5, gt=0)
+    loocc_weight: float = Field(default=0.01, ge=0)  # of LOOCC in the total loss
+    loocc_temperature: float = Field(default=0.5, gt=0)  # of cosines in LOOCC (NT-Xent)
     cycle_weight: float = Field(default=0.0, ge=0)  # light and camera predicted from LOOCC's renderings
     template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo
     release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own gradually
@@ -94,7 +94,7 @@ class OptimiserSettings(Settings):
     learning_rate: float = Field(default=1e-4, gt=0)
     final_rate: float = Field(default=1.0, gt=0, le=1)  # share of learning_rate at the end
     weight_decay: float = Field(default=5e-4, ge=0)
-    warmup_images: int = Field(default=0, ge=0)
+    warmup_images: int = Field(default=0, ge=0)  # images over which the rate rises to learning_rate
     betas: tuple[float, float] = (0.9, 0.999)
 
     def rate(self, images: int, total_images: int) -> float:
@@ -119,14 +119,14 @@ class LoopSettings(Settings):
     checkpoint_every: int = Field(default=20_000, ge=1)  # images between checkpoints
     patience: int = Field(default=10, ge=1)  # validations without improvement before stopping
     keep: Literal["best", "last"] = "best"  # the model: of the best validation, or of the last checkpoint
-    horizontal_flips: bool = True
+    horizontal_flips: bool = True  # show half of the images mirrored
     reframed: float = Field(default=0.0, ge=0, le=1)  # share of the images shown in another crop
     reframe: CropSettings = DEFAULT_CROPS
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
-    channels_last: bool = True
+    channels_last: bool = True  # memory layout of networks: speed only
     cuda_graph: Literal["auto", "off"] = "auto"  # on a GPU: replay recorded steps where that is faster
-    deterministic: bool = False
+    deterministic: bool = False  # repeat a run bit for bit, slower
     watch: bool = True  # look for collapse and return to the last good checkpoint
     seed: int = 0
 
@@ -171,7 +171,7 @@ class TargetSettings(Settings):
 
     labels: tuple[str, ...] = ()  # label columns: one of classes, or any number of two values each
     factors: tuple[str, ...] = ("geometry", "albedo")  # whose codes the head takes
-    weight: float = Field(default=1.0, gt=0)
+    weight: float = Field(default=1.0, gt=0)  # of the labels' loss
     rendering_weight: float = Field(default=1.0, ge=0)  # 0: nothing is rendered, plain fine-tuning
     labelled: int | None = Field(default=None, ge=2)  # training images whose labels are used; None: all
 

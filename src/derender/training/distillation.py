@@ -72,7 +72,7 @@ class RefiningSettings(StudentSettings):
     """How encoders and decoders learn the fitted scenes."""
 
     fitted: int = Field(default=12_000, ge=2)  # at most so many images are fitted
-    fit_steps: int = Field(default=STEPS, ge=1, le=10_000)
+    fit_steps: int = Field(default=STEPS, ge=1, le=10_000)  # steps by which each scene is optimised
     worst: float = Field(default=0.03, ge=0, lt=1)  # share of them, fitted worst, that is left out
     rendered: float = Field(default=0.5, ge=0, le=1)  # share of a batch that are renderings
     exchanged: float = Field(default=0.5, ge=0, le=1)  # share of those with another's geometry

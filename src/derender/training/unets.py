@@ -38,8 +38,8 @@ class UNetSettings(StudentSettings):
     batch_size: int = Field(default=32, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
     weight_decay: float = Field(default=1e-4, ge=0)
-    code_weight: float = Field(default=0.1, ge=0)
-    unet_width: int = Field(default=16, ge=1)
+    code_weight: float = Field(default=0.1, ge=0)  # of codes beside pixels
+    unet_width: int = Field(default=16, ge=1)  # first channels of the U-Nets
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # of the students alone
 
 

@@ -3,7 +3,7 @@
 
 const $ = (id) => document.getElementById(id);
 const NAMES = {
-  input: "the crop as the model sees it",
+  input: "the crop that the model receives",
   reconstruction: "rendered from all factors",
   depth: "bright is near, dark is far",
   normals: "red to the right, green up, blue to the viewer",
@@ -331,7 +331,7 @@ function tell() {
   say(`${first.name}: ${part}.`);
   $("framing").value = first.framed === "no face" ? "none" : first.framed;
   $("unlike").hidden = !first.out_of_distribution;
-  $("unlike").textContent = "The model reconstructs this crop worse than nearly all it was validated on: it may show something else than the model knows. Read its factors with care.";
+  $("unlike").textContent = "The model reconstructs this crop worse than nearly all validation images: it may show another kind of object. Read its factors with care.";
 }
 
 const recrop = newest(async () => {
