@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_755, 246)  # on the way to (37_000, 270)
-TEST_LINES = 25_965
+TOTAL = (39_760, 246)  # on the way to (37_000, 270)
+TEST_LINES = 25_985
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -67,6 +67,20 @@ def test_new_light_is_nearer_to_the_truth_than_the_photograph():
     assert (seen - truth)[mask].abs().mean() < 0.3 * (photo - truth)[mask].abs().mean()
 
 
+def test_strong_new_light_keeps_fine_detail():
+    """Grain of the photograph has the contrast that it has in the same light, however far light moves."""
+    scene, other = bump((0.1, 0.9, 0.0, 0.8)), torch.tensor([[0.3, 0.9, 0.0, -0.9]])
+    photo, truth = (textured(s) for s in (scene, scene.with_parameters(light=other)))
+    seen = PhotoDetail(photo, scene, FOV)(scene.with_parameters(light=other)).image[0]
+
+    def grain(image: torch.Tensor) -> torch.Tensor:
+        smooth = avg_pool2d(image[None], 5, stride=1, padding=2)[0]
+        inner = slice(LARGE // 3, -LARGE // 3)
+        return (image / smooth.clamp(min=0.01))[:, inner, inner]
+
+    assert grain(seen).std() > 0.9 * grain(truth).std()
+
+
 def test_new_light_leaves_what_is_behind_the_object():
     light, view = LIGHTS["frontal"].model_copy(update={"yaw_deg": (0, 0)}), VIEWS["frontal"]
     settings = FaceSettings(light=light, view=view, backgrounds=("plain",))

@@ -7,10 +7,10 @@ back. A point that it does not show is taken from its mirror image where that is
 model's albedo, moved to the photograph's colours; the three blend. Around the model's maps the surface
 continues into a plane through the object's centre: hair, neck and background follow and come to rest.
 New light falls on the object alone, whose outline GrabCut (Rother et al., SIGGRAPH 2004) finds by colour.
-The more shading or view change, the more the model's colours weigh: what it explained wrongly would otherwise
-stay in the surface. Shading multiplies coded (sRGB) values, as in training: on Extended Yale B that is nearer
-to the truth than the same ratio in linear light. Highlights and haze that the renderer knows are taken off
-and drawn anew; what they cannot explain stays.
+The more shading or view change, the more the model's colours weigh, after a change of shading in their smooth
+part: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
+as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
+and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
 """
 
 from math import atan, degrees, radians, tan
@@ -36,7 +36,8 @@ FACING = (0.20, 0.45)  # cosine between surface and ray: below, a photograph tel
 MOVED = (0.01, 0.03)  # shares of the side: if nothing moves more than the first, all is the photograph's
 LIT = (0.10, 0.25)  # shading, as FACING
 LEAST_SHADING, LARGEST_RATIO = 0.05, 20.0
-DISTRUST = 4.0  # detail weighs 1 / (1 + DISTRUST (m² + d²)): mean squared log ratio, most shift in half sides
+DISTRUST = 4.0  # detail weighs 1 / (1 + DISTRUST m²): mean squared log ratio, or most shift in half sides
+DETAIL_SHARE = 0.03  # of the side: reach of what a change of light leaves of the photograph
 HIDDEN_BEHIND = 0.01  # scene units that a point may lie behind what is seen there
 FEATHER_SHARE = 1 / 30  # width of the blends, of the image's width
 COLOUR_SHARE = 1 / 12  # reach of the colours carried over to what is not seen
@@ -111,14 +112,14 @@ class PhotoDetail:
         mirror_seen = inside * (1 - seen) * mirrored[:, 2:3] * mirrored[:, -1:]
         ratio, mirror_ratio = _ratio(shading, own[:, 3:4]), _ratio(shading, mirrored[:, 3:4])
         change = (ratio.log().square() * inside).sum(dim=(2, 3)) / inside.sum(dim=(2, 3)).clamp(min=1)
-        change = change[:, :, None, None].square() + (2 * moved).square()
+        changes = torch.cat((change[:, :, None, None], 2 * moved), dim=1).square()
         lit = own[:, -1:]
-        trust = 1 - inside * lit * (1 - 1 / (1 + DISTRUST * change))
+        doubts = inside * lit * (1 - 1 / (1 + DISTRUST * changes))
         shift = _filled(shift * covered, covered) * self._inward().to(shift)
         veils = (inside * one for one in (own[:, 4:-1], mirrored[:, 4:-1], veil))
         faded, drawn = self._faded(ratio, inside) ** lit, colours * shading
         fields = (shift, mirror_shift, seen, mirror_seen, faded, mirror_ratio, drawn, *veils)
-        image, depth = self._composed(fields, trust), self._enlarged(view.depth[:, None])[:, 0]
+        image, depth = self._composed(fields, doubts), self._enlarged(view.depth[:, None])[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
     def _faded(self, ratio: Tensor, inside: Float[Tensor, "n 1 w w"]) -> Float[Tensor, "n 1 w w"]:
@@ -158,7 +159,7 @@ class PhotoDetail:
         weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
         fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
         fields += (self._veil, self._veil.flip(-1), 0 * self._veil)
-        return self._composed(fields, torch.ones(1, 1, 1, 1))
+        return self._composed(fields, torch.zeros(1, 2, 1, 1))
 
     def _inward(self) -> Float[Tensor, "w w"]:
         """1 in the crop, falling to 0 at the border of the photograph around it."""
@@ -168,30 +169,31 @@ class PhotoDetail:
         return rise * rise[:, None]
 
     def _composed(
-        self, fields: tuple[Tensor, ...], trust: Float[Tensor, "n 1 h w"]
+        self, fields: tuple[Tensor, ...], doubts: Float[Tensor, "n 2 h w"]
     ) -> Float[Tensor, "n 3 s s"]:
         """Images at the photograph's size, from fields on the wide grid.
 
         Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
-        model's colours, and veils: of both, and the new one; trust is the weight of detail beside colours.
+        model's colours, and veils: of both, and the new one. Doubts weigh those colours against the
+        photograph: their smooth part, where light changed, and all of them, where things moved.
         """
         shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = fields
-        trust = trust.expand_as(seen)
-        shown = self._all_enlarged(shift, ratio, drawn, trust, seen, veil, new)
-        shift, ratio, drawn, trust, seen, veil, new = shown
+        doubts = doubts.expand(-1, -1, *seen.shape[2:])
+        shown = self._all_enlarged(shift, ratio, drawn, doubts, seen, veil, new)
+        shift, ratio, drawn, doubts, seen, veil, new = shown
         drawn = drawn.clamp(DARKEST, 1)
-        image = seen * self._detailed(shift, ratio, drawn, trust, veil, new)
+        image = seen * self._detailed(shift, ratio, drawn, doubts, veil, new)
         if bool((unseen := (seen < 0.999).any(dim=0)[0]).any()):
             part = (..., *(slice(int(at.min()), int(at.max()) + 1) for at in unseen.nonzero().T))
             mirrored = self._all_enlarged(mirror_shift, mirror_ratio, mirror_seen, mirror_veil)
             shift, ratio, weight, veil = (field[part] for field in mirrored)
-            drawn, trust, seen, new = (field[part] for field in (drawn, trust, seen, new))
-            other = self._detailed(shift, ratio, drawn, trust, veil, new, part)
+            drawn, doubts, seen, new = (field[part] for field in (drawn, doubts, seen, new))
+            other = self._detailed(shift, ratio, drawn, doubts, veil, new, part)
             image[part] += weight * other + (1 - seen - weight) * _veiled(drawn, new)
         return image.clamp(0, 1)
 
     def _detailed(
-        self, shift: Tensor, ratio: Tensor, drawn: Tensor, trust: Tensor, veil: Tensor, new: Tensor,
+        self, shift: Tensor, ratio: Tensor, drawn: Tensor, doubts: Tensor, veil: Tensor, new: Tensor,
         part: tuple[Any, ...] = (...,),
     ) -> Tensor:  # fmt: skip
         """The photograph looked up at shifted places, its shading changed, and its veil to the new one."""
@@ -205,8 +207,11 @@ class PhotoDetail:
             clear = _cleared(result, veil)
             kept = clear.clamp(0, 1)
             beyond = _veiled(clear, veil) - _veiled(kept, veil)
-        surface = torch.lerp(drawn.log(), (kept * ratio).clamp(DARKEST, 1).log(), trust).exp()
-        return _veiled(surface, new) + beyond
+        edited, (lit, moved) = (kept * ratio).clamp(DARKEST, 1).log(), doubts.split(1, dim=1)
+        wrong, reach = drawn.log() - edited, DETAIL_SHARE * self.size
+        smooth = _blurred(lit * wrong, reach) / _blurred(lit, reach).clamp(min=DARKEST)
+        surface = edited + torch.lerp(lit * smooth, wrong, moved)
+        return _veiled(surface.clamp(max=0).exp(), new) + beyond
 
     def _all_enlarged(self, *fields: Tensor) -> tuple[Tensor, ...]:
         return self._enlarged(torch.cat(fields, dim=1)).split([field.shape[1] for field in fields], dim=1)
@@ -316,7 +321,7 @@ def _ramp(value: Tensor, low: float, high: float) -> Tensor:
 
 def _blurred(maps: Tensor, reach: float) -> Tensor:
     """Three box filters of so many pixels to either side, on a quarter of the resolution."""
-    small = interpolate(maps, scale_factor=0.25, mode="area")
+    small = interpolate(maps, [max(1, side // 4) for side in maps.shape[-2:]], mode="area")
     return interpolate(_averaged(small, max(1, round(reach / 4))), maps.shape[-2:], mode="bilinear")
 
 
