@@ -72,12 +72,15 @@ $(RESULTS)/robustness-cars.json: | $(STAMP)
 	$(SCORE) evaluate robustness --model cars-64 --pictures cars
 
 # Results on sets that come from their owners: lfw64.zip, utkface64.zip and celeba64.zip in IMAGES, aligned, 64 pixels;
-# the cropped Extended Yale B as yaleb.zip, and pairs.txt of LFW.
+# celebamask128.zip; the cropped Extended Yale B as yaleb.zip, and pairs.txt of LFW.
 PUBLISHED := benchmarks/results/published
 LFW := --label identity --min-count 20 --max-count 20
+SEGMENT := --model build/faces-unet --variants joint-whole,joint-random,random
 published: $(STAMP)  ## repeat results on LFW, UTKFace, CelebA and Yale B: make published IMAGES=folder (hours, resumable)
 	@mkdir -p build; test -f build/lfw-fitted.parquet || $(BIN)/derender embed $(IMAGES)/lfw64.zip --model faces-64 \
 	  --fit-steps 20 --keep-duplicates --out build/lfw-fitted.parquet
+	@test -d build/faces-unet || $(BIN)/derender unet $(IMAGES)/utkface64.zip --model faces-64 --out build/faces-unet \
+	  --set images=96000 --set precision=bf16-mixed
 	@for step in "lfw evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW)" \
 	  "lfw-fitted evaluate cluster --features build/lfw-fitted.parquet $(LFW)" \
 	  "lfw-finch evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW) --method finch" \
@@ -98,6 +101,9 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace, CelebA and Yale B: make 
 	  "compare-identity compare --table identity --model faces-64 $(IMAGES)/lfw64.zip" \
 	  "compare-emotion compare --table emotion --model faces-64 $(IMAGES)/lfw64.zip" \
 	  "compare-clustering compare --table clustering --model faces-64 $(IMAGES)/celeba64.zip" \
+	  "segmentation-640 evaluate segment $(IMAGES)/celebamask128.zip $(SEGMENT)" \
+	  "segmentation-320 evaluate segment $(IMAGES)/celebamask128.zip $(SEGMENT) --labelled 320" \
+	  "segmentation-100 evaluate segment $(IMAGES)/celebamask128.zip $(SEGMENT) --labelled 100" \
 	  "celeba evaluate cluster $(IMAGES)/celeba64.zip --model faces-64 --attributes --resamples 200"; do \
 	  set -- $$step; name=$$1; shift; $(BIN)/python benchmarks/score.py $(PUBLISHED)/$$name.json "$$@" || exit 1; \
 	done; $(BIN)/python docs/pages.py

@@ -16,6 +16,8 @@ from paper_rows import kept
 from renderer_tables import spread
 from side_by_side import CARS, HEADS_FILE, LFW, SIDE_BY_SIDE, Reader
 
+from derender.evaluation.paper_tables import SEGMENTATION
+
 
 def table(name: str) -> str:
     """One table as Markdown, with a note that names its files."""
@@ -23,7 +25,6 @@ def table(name: str) -> str:
     head, *rows = body(name)
     lines = ["| " + " | ".join(line) + " |" for line in (head, *rows)]
     note = ", ".join(f"`benchmarks/results/{file}`" for file in files.split())
-    note += " (`tables`: transcribed from output that was not kept)" if "tables/" in files else ""
     shown = "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
     return f"{shown}\n\n{textwrap.fill(f'Source: {note}.', 118, break_on_hyphens=False)}\n"
 
@@ -71,7 +72,7 @@ SUMMARY = (
     (
         "19 face parts from 640 masks, mIoU",
         "{segmentation|joint encoders and decoder, distilled|640 masks}",
-        "two fresh encoders {segmentation|random start, joint (control)|640 masks}",
+        "one fresh encoder {segmentation|random start, one encoder (control)|640 masks}",
         "100 masks: PCA "
         "{segmentation|PCA (64), each place's classes by linear regression (control)|100 masks} to "
         "{segmentation|joint encoders and decoder, distilled|100 masks}",
@@ -85,21 +86,27 @@ SUMMARY = (
 )
 
 
-def segmented(result: Any) -> Iterator[list[str]]:
+def segmented(_: Any) -> Iterator[list[str]]:
     """mIoU of each network with fewer and fewer masks, and the paper's."""
-    fewer = {row["name"]: row for row in kept("tables/segmentation-masks.json")["rows"]}
-    yield ["mIoU", *(f"{count} masks" for count in fewer), "the paper"]
-    for row, key in zip(
-        result["rows"], ("distilled", "random_joint", "random_one", "pca", "place"), strict=False
-    ):
-        scores = [
-            line[key] if isinstance(line[key], dict) else {"value": line[key]} for line in fewer.values()
+    yield ["mIoU", *(f"{count} masks" for count in MASKS), "the paper"]
+    paper = {line.method: line.scores for line in SEGMENTATION.paper}
+    for name, (title, method) in NETS.items():
+        scores = [kept(file)["rows"][name]["scores"]["mean_iou"] for file in MASKS.values()]
+        yield [
+            title,
+            *(f"{one['value']:.3f}" + (f" ± {one['spread']:.3f}" if one["spread"] else "") for one in scores),
+            f"{paper[method]['mean_iou']:.3f}" if method else "",
         ]
-        cells = [
-            f"{one['value']:.3f}" + (f" ± {one['spread']:.3f}" if "spread" in one else "") for one in scores
-        ]
-        note = " (control)" * row.get("control", False)
-        yield [row["name"] + note, *cells, f"{row['paper_miou']:.3f}" if "paper_miou" in row else ""]
+
+
+MASKS = {count: f"published/segmentation-{count}.json" for count in (640, 320, 100)}
+NETS = {  # by their names in the files: a row's title, and that of the paper
+    "joint, decoder too": ("joint encoders and decoder, distilled", "Joint Encoders"),
+    "random start, joint": ("random start, joint (control)", ""),
+    "random start": ("random start, one encoder (control)", "Supervised (random init)"),
+    "PCA": ("PCA (64), each place's classes by linear regression (control)", ""),
+    "each place's class": ("each place's most frequent class (control)", ""),
+}
 
 
 def edits(which: str, angles: Mapping[str, str], names: Mapping[str, str]) -> Reader:
@@ -323,11 +330,10 @@ KILLED = (
 )  # fmt: skip
 KILLED_AS = {"identify": "evaluate identify", "plan": "compare --plan", "video": "relight CLIP"}
 
-MASKS = "tables/segmentation.json tables/segmentation-masks.json"
 FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for the reader
-    "segmentation": (MASKS, segmented),
+    "segmentation": (" ".join(MASKS.values()), segmented),
     "summary": (
-        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json {CARS} {MASKS}",
+        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json {CARS} {MASKS[640]} {MASKS[100]}",
         summary,
     ),
     "faces-128": ("sharpness.json", sharp),
