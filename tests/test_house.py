@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_690, 15),
     "features": (1_390, 8),  # a folder is refused before images are embedded
     "interpretation": (1_085, 5),
-    "photo": (1_520, 7),  # the surface that is shaded is smoothed
+    "photo": (1_530, 7),  # fine detail stays under new light
     "networks": (710, 5),
     "storage": (965, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_760, 246)  # on the way to (37_000, 270)
+TOTAL = (39_770, 246)  # on the way to (37_000, 270)
 TEST_LINES = 25_985
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

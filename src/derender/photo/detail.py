@@ -208,9 +208,8 @@ class PhotoDetail:
             kept = clear.clamp(0, 1)
             beyond = _veiled(clear, veil) - _veiled(kept, veil)
         edited, (lit, moved) = (kept * ratio).clamp(DARKEST, 1).log(), doubts.split(1, dim=1)
-        wrong, reach = drawn.log() - edited, DETAIL_SHARE * self.size
-        smooth = _blurred(lit * wrong, reach) / _blurred(lit, reach).clamp(min=DARKEST)
-        surface = edited + torch.lerp(lit * smooth, wrong, moved)
+        wrong = drawn.log() - edited
+        surface = edited + torch.lerp(lit * _smooth(wrong, lit, DETAIL_SHARE * self.size), wrong, moved)
         return _veiled(surface.clamp(max=0).exp(), new) + beyond
 
     def _all_enlarged(self, *fields: Tensor) -> tuple[Tensor, ...]:
@@ -321,8 +320,18 @@ def _ramp(value: Tensor, low: float, high: float) -> Tensor:
 
 def _blurred(maps: Tensor, reach: float) -> Tensor:
     """Three box filters of so many pixels to either side, on a quarter of the resolution."""
-    small = interpolate(maps, [max(1, side // 4) for side in maps.shape[-2:]], mode="area")
-    return interpolate(_averaged(small, max(1, round(reach / 4))), maps.shape[-2:], mode="bilinear")
+    return interpolate(_averaged(_small(maps), max(1, round(reach / 4))), maps.shape[-2:], mode="bilinear")
+
+
+def _smooth(maps: Tensor, weight: Float[Tensor, "n 1 h w"], reach: float) -> Tensor:
+    """The weighted mean around each pixel, as ``_blurred``."""
+    known = _small(weight)
+    sums = _averaged(torch.cat((known * _small(maps), known), dim=1), max(1, round(reach / 4)))
+    return interpolate(sums[:, :-1] / sums[:, -1:].clamp(min=DARKEST), maps.shape[-2:], mode="bilinear")
+
+
+def _small(maps: Tensor) -> Tensor:
+    return interpolate(maps, [max(1, side // 4) for side in maps.shape[-2:]], mode="area")
 
 
 def _averaged(maps: Tensor, reach: int) -> Tensor:
