@@ -117,7 +117,8 @@ def opening(address: str | Path | None = None, side: int = 512) -> Opening:
 
 def portraits(side: int) -> list[Photo]:
     """Generated heads of different people, lit from the front and, the last, from the side."""
-    lights = [LIGHTS["frontal"]] * (SHOWN - 1) + [LightSettings(yaw_deg=(32, 32), pitch_deg=(20, 20))]
+    aside = LightSettings(yaw_deg=(32, 32), pitch_deg=(20, 20), ambient=(0.3, 0.3), diffuse=(0.55, 0.55))
+    lights = [LIGHTS["frontal"]] * (SHOWN - 1) + [aside]
     made = []
     for row, light in enumerate(lights):
         settings = FaceSettings(
