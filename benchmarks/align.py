@@ -234,7 +234,7 @@ def framings(faces: Faces, count: int, seed: int) -> dict[str, dict[str, float]]
     def features(pixels: list[np.ndarray], frame: str) -> np.ndarray | None:
         """(n, d) unit vectors; None where a face is missed."""
         try:
-            cuts = [found_frame(one, model, frame)[0].cut(one, model.image_size) for one in pixels]
+            cuts = [found_frame(one, model, frame).frame.cut(one, model.image_size) for one in pixels]
         except ValueError:
             return None
         results = model.embed(torch.from_numpy(np.stack(cuts)).float() / 255)

@@ -18,14 +18,14 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (7_415, 32),
     "evaluation": (7_425, 36),  # public functions name their errors
-    "report": (4_110, 25),  # one image as a single file
-    "cli": (2_335, 32),  # one image as a single file
-    "training": (3_485, 17),  # CUDA graphs
+    "report": (4_120, 25),  # images that do not suit a model are left out
+    "cli": (2_340, 32),  # the same
+    "training": (3_490, 17),  # CUDA graphs; the model that fits better
     "baselines": (2_485, 11),
     "render": (1_690, 15),
     "features": (1_390, 8),  # a folder is refused before images are embedded
     "interpretation": (1_085, 5),
-    "photo": (1_530, 7),  # fine detail stays under new light
+    "photo": (1_560, 7),  # why a photograph does not suit a model
     "networks": (710, 5),
     "storage": (965, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_770, 246)  # on the way to (37_000, 270)
-TEST_LINES = 25_985
+TOTAL = (39_820, 246)  # on the way to (37_000, 270)
+TEST_LINES = 26_025
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -1,5 +1,8 @@
 """A photograph in, a photograph out: any kind of image, faces found, edits where they belong."""
 
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +14,8 @@ from derender.photo import Frame, find_faces, found_frame, open_photograph
 from derender.photo.edit import FIT_STEPS
 from derender.photo.faces import BOTH_FAMILIES, frame_of
 from derender.postprocess import Features
+
+MODULE = sys.modules["derender.photo.edit"]
 
 
 @pytest.fixture(scope="module")
@@ -39,15 +44,37 @@ def test_a_rolled_face_gives_a_rolled_frame(photo, roll):
 
 def test_frames_by_name(photo, model):
     pixels = np.asarray(photo)
-    assert found_frame(pixels, model, "none") == (Frame.centred(640, 480), "none")
+    assert found_frame(pixels, model, "none") == (Frame.centred(640, 480), "none", "")
     assert found_frame(pixels, model)[1] == found_frame(pixels, model, "face")[1] == "face"
     empty = np.full((200, 300, 3), 128, np.uint8)
-    assert found_frame(empty, model) == (Frame.centred(300, 200), "no face")
+    assert found_frame(empty, model) == (Frame.centred(300, 200), "no face", "no face is found")
+    with pytest.warns(UserWarning, match="no face is found; choose frame auto or none"):
+        assert np.abs(derender.rotate(empty, model, yaw_deg=0).astype(int) - 128).max() <= 1
     assert found_frame(empty[:64, :64], model)[1] == "none"
     with pytest.raises(ValueError, match="no face is found"):
         found_frame(empty, model, "face")
     with pytest.raises(ValueError, match="did you mean 'face'"):
         found_frame(empty, model, "fase")
+
+
+def test_why_a_photograph_does_not_suit_the_model(photo, model, monkeypatch):
+    pixels = np.asarray(photo)
+    face = find_faces(pixels)[0]
+
+    def doubt(**changed: object) -> tuple[str, str]:
+        monkeypatch.setattr(MODULE, "face_candidates", lambda _: [replace(face, **changed)])
+        _, how, why = found_frame(pixels, model)
+        return how, why
+
+    nose = face.points[2] + np.float32([1, 0]) * 0.9 * (face.points[0] - face.points[1])
+    turned = face.points.copy()
+    turned[2] = nose
+    assert (
+        doubt(points=turned)[0] == "profile" and "degrees, models of faces know 60" in doubt(points=turned)[1]
+    )
+    rejected = "confidence 0.90 is below 0.95"
+    assert doubt(rejected=rejected) == ("no face", f"no face is found (surest candidate: {rejected})")
+    assert "perhaps a profile, turned by" in doubt(points=turned, rejected=rejected)[1]
 
 
 def test_edits_change_the_face_and_leave_the_rest(photo, model):

@@ -3,7 +3,7 @@
 from functools import partial
 from typing import TYPE_CHECKING
 
-from derender.cli.options import ImageFiles, ImageModel, Output, command, opener_of, option
+from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, opener_of, option
 from derender.report.options import MESH_FORMATS, MESH_SIZE, TEXTURE_SIZE, ImageOptions
 from derender.storage.places import require_known
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @command("decompose", "decompose --model runs/faces me.jpg you.png --out apart/")
 def decompose(
-    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: ImageOutput,
     sheet: bool = option(False, "Also draw all images below each other as sheet.png.", "--sheet"),
 ) -> None:  # fmt: skip
     """Write a folder per image: panel.png, one PNG per factor, scene.json and scene.npz."""
@@ -26,7 +26,7 @@ def decompose(
 
 @command("mesh", "mesh --model runs/faces me.jpg --format glb --out meshes/")
 def mesh(
-    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: ImageOutput,
     form: str = option("glb", "glb, or obj with its .mtl and .png.", "--format", metavar="glb|obj"),
     grazing: float = option(85.0, "Angle in degrees beyond which the surface is cut off at its rim."),
 ) -> None:  # fmt: skip

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from derender.cli.options import ImageFiles, ImageModel, Output, command, opener_of, option
+from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, opener_of, option
 from derender.report.options import EDIT_SIZE, FilmOptions, ImageOptions
 
 FACTOR = "Factor to take; may be repeated. By default each in turn."
@@ -12,7 +12,7 @@ FACTOR = "Factor to take; may be repeated. By default each in turn."
 
 @command("relight", "relight --model runs/faces me.jpg --like sunset.jpg --out relit/")
 def relight(
-    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: ImageOutput, film: FilmOptions,
     like: Path | None = option(None, "Go to the lighting of this image.", metavar="IMAGE"),
     reach: float = option(60.0, "Reach to either side, in degrees; a single file shows the light there."),
     pitch: float = option(10.0, "Height of the light, in degrees."),
@@ -36,7 +36,7 @@ def relight(
 
 @command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")
 def rotate(
-    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output, film: FilmOptions,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: ImageOutput, film: FilmOptions,
     reach: float = option(40.0, "Rotation to either side, in degrees; a single file shows it."),
     pitch: float = option(0.0, "Nod in degrees: the top comes forward."),
 ) -> None:  # fmt: skip
@@ -51,7 +51,7 @@ def rotate(
 
 @command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")
 def swap(
-    files: ImageFiles, model: ImageModel, how: ImageOptions, output: Output,
+    files: ImageFiles, model: ImageModel, how: ImageOptions, output: ImageOutput,
     source: Path = option(..., "Image to take from.", "--from", metavar="IMAGE"),
     factor: list[str] | None = option(None, FACTOR, metavar="NAME"),
 ) -> None:  # fmt: skip

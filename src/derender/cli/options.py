@@ -125,6 +125,13 @@ class Output:
 
 
 @dataclass(frozen=True)
+class ImageOutput(Output):
+    """The same for commands that draw images."""
+
+    force: bool = option(False, "Replace existing output; draw images that do not suit the model.", "--force")
+
+
+@dataclass(frozen=True)
 class DataOptions:
     """The images of a command: one data set, by address."""
 
@@ -243,7 +250,7 @@ class ImageFiles:
         return single_suffix(self.out)
 
     def edit(
-        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: Output, **how: Any
+        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: ImageOutput, **how: Any
     ) -> None:
         """Edit, write and report every image; exit code 2 where one that was named cannot be read.
 

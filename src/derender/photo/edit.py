@@ -5,11 +5,12 @@ from another side by ``PhotoDetail``, and put back into the photograph. Results 
 given: a Pillow image for a path or a Pillow image, an array for an array, a tensor for a tensor.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from derender.data import GivenImages, as_photos
 from derender.inputs import as_model
 from derender.model import Derenderer
 from derender.photo.detail import PhotoDetail
-from derender.photo.faces import PROFILE_DEG, UTKFACE, find_faces, frame_of, template_of
+from derender.photo.faces import PROFILE_DEG, UTKFACE, Face, face_candidates, frame_of, template_of
 from derender.photo.frame import Frame
 from derender.render import Rendering
 from derender.scene import Scene
@@ -39,6 +40,9 @@ LARGEST_CROP = 1024
 
 MARGIN = 0.35
 """How far edits reach beyond the frame, in shares of its side."""
+
+SIDEWAYS_DEG = 25.0
+"""A rejected candidate that is turned farther may be a profile: generated ones measure 25 to 45 degrees."""
 
 FRAMES = ("face", "auto", "none")
 """Ways to find the part of a photograph that a model is given."""
@@ -129,10 +133,12 @@ def open_photograph(
     Args:
         pixels: the photograph.
         model: trained.
-        frame: as `found_frame` takes it.
+        frame: as `found_frame` takes it. A photograph that does not suit the model is a warning.
         fit_steps: as `editable_scenes` takes them.
     """
-    place = found_frame(pixels, model, frame)[0]
+    place, _, doubt = found_frame(pixels, model, frame)
+    if doubt:
+        warnings.warn(f"{doubt}; choose frame auto or none if that is meant", stacklevel=2)
     own = model.image_size
     small = torch.from_numpy(place.cut(pixels, own)[None]).to(model.device).float() / 255
     return Photograph.of(pixels, place, editable_scenes(model, small, fit_steps), model)
@@ -212,10 +218,18 @@ def rotate(
     return _each(image, turned)
 
 
+class FoundFrame(NamedTuple):
+    """The part of a photograph that a model is given, and how it was found."""
+
+    frame: Frame
+    how: str  # "face", "profile", "auto", "none", or "no face": the middle square
+    doubt: str = ""  # the measured reason why it does not suit the model
+
+
 def found_frame(
     pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, frame: str | None = None
-) -> tuple[Frame, str]:
-    """The part of a photograph that suits a model, and how it was found.
+) -> FoundFrame:
+    """The part of a photograph that suits a model.
 
     Args:
         pixels: the photograph.
@@ -232,17 +246,32 @@ def found_frame(
         squares = _squares(middle, pixels.shape[1], pixels.shape[0])
         cuts = np.stack([square.cut(pixels, SEARCH_SCALE * model.image_size) for square in squares])
         at, crop = best_crop(model, torch.from_numpy(cuts))
-        return squares[at].part(crop.across, crop.down, crop.side).snapped(), "auto"
+        return FoundFrame(squares[at].part(crop.across, crop.down, crop.side).snapped(), "auto")
     template = template_of(model)
     if frame == "none" or (frame is None and (template is None or middle.side <= model.image_size)):
-        return middle, "none"
-    faces = find_faces(pixels)
-    if faces:
-        result = "face" if abs(faces[0].yaw_deg) <= PROFILE_DEG else "profile"
-        return frame_of(faces[0], template or UTKFACE).snapped(), result
+        return FoundFrame(middle, "none")
+    candidates = face_candidates(pixels)
+    face = next((candidate for candidate in candidates if not candidate.rejected), None)
+    if face is not None:
+        place, turned = frame_of(face, template or UTKFACE).snapped(), abs(face.yaw_deg)
+        if turned <= PROFILE_DEG:
+            return FoundFrame(place, "face")
+        doubt = f"the face is turned by {turned:.0f} degrees, models of faces know {PROFILE_DEG:.0f}"
+        return FoundFrame(place, "profile", doubt)
+    doubt = f"no face is found{_nearest_to_a_face(candidates)}"
     if frame is None:
-        return middle, "no face"
-    raise ValueError("no face is found in this image: choose frame auto or none")
+        return FoundFrame(middle, "no face", doubt)
+    raise ValueError(f"{doubt}: choose frame auto or none")
+
+
+def _nearest_to_a_face(candidates: list[Face]) -> str:
+    """What the surest of rejected candidates lacks, in brackets; empty where there are none."""
+    if not candidates:
+        return ""
+    surest = max(candidates, key=lambda candidate: candidate.confidence)
+    turned = abs(surest.yaw_deg)
+    profile = f"perhaps a profile, turned by {turned:.0f} degrees or more; " if turned >= SIDEWAYS_DEG else ""
+    return f" ({profile}surest candidate: {surest.rejected})"
 
 
 def _squares(middle: Frame, width: int, height: int) -> list[Frame]:

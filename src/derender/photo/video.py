@@ -88,7 +88,7 @@ def edit_video(
         if count > LONGEST_FRAMES:
             raise ValueError(f"{video} has more than {LONGEST_FRAMES:,} frames: cut it into parts")
         if not faces:
-            places[0] = found_frame(pixels, model, "none")[0]
+            places[0] = found_frame(pixels, model, "none").frame
         elif (count - 1) % every == 0 and (place := _tracked(pixels, model, places)) is not None:
             places[count - 1] = place
         report(count, max(count, total), description="finding faces")

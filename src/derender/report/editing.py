@@ -22,21 +22,17 @@ from PIL import Image
 from derender.photo import edit_video, is_video
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
-from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
+from derender.report.opening import ImageOpener, OpenedImage, Read, image_files, readable
 from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
 from derender.storage.atomic import atomic_file, atomic_folder
 from derender.storage.places import counted
-from derender.training.held_out_errors import OUTLIER_PERCENTILE, unlike
+from derender.training.held_out_errors import OUTLIER_PERCENTILE, fitting_better, unlike
 from derender.training.process import locked
 
 FILM = "film.mp4"
 ROWS = ".sheet"
 """Folder of the rows of a sheet, a file for each image, until the sheet is drawn."""
-NOTED = {
-    "no face": "no face: the middle of {count:,} is shown",
-    "profile": "turned by more than 60 degrees, which the model does not know: {count:,}",
-}
 NAMED = 5
 """So many images that cannot be read are named."""
 
@@ -76,7 +72,7 @@ class WrittenImages:
             lines[NAMED:] = [f"and {more:,} more (--json names all)"]
         if self.before:
             lines.append(f"{self.before:,} done before")
-        if self.percentiles:
+        if self.percentiles and not self.unlike:
             span = _span(self.percentiles.values())
             lines.append(f"reconstructed worse than {span} % of the images this model was validated on")
         if self.unlike:
@@ -84,12 +80,11 @@ class WrittenImages:
             lines.append(f"{self.unlike}; {first} is one")
         result = Counter(part["found"] for part in self.framing.values())
         faces = result["face"] + result["profile"]
-        if faces or result["no face"]:
-            lines.append(f"a face was found in {faces:,} of {counted(result.total(), 'images')}")
-        for what, then in NOTED.items():
-            if count := result[what]:
-                first = next(path for path, part in self.framing.items() if part["found"] == what)
-                lines.append(f"{then.format(count=count)} ({first} for one)")
+        if result.total() > 1 and (faces or result["no face"]):
+            lines.append(f"a face was found in {faces:,} of {result.total():,} images")
+        if doubts := {path: part["doubt"] for path, part in self.framing.items() if "doubt" in part}:
+            path, doubt = next(iter(doubts.items()))
+            lines.append(f"drawn all the same: {counted(len(doubts), 'images')}, as {path}: {doubt}")
         if result["auto"]:
             sides = [100 * part["side"] for part in self.framing.values() if part["side"] < 1]
             share = f", {_span(sides)} % of their side" if sides else ""
@@ -122,7 +117,7 @@ def write_images(
         paths: image files, videos, and folders of them.
         out: folder of the folders.
         edit: makes of an opened image what is written.
-        force: replace what is there.
+        force: replace what is there, and draw images that do not suit the model.
         sheet: also draw a row for every image as sheet.png; by default for two images or more. With
             ``resume`` it shows those of the interrupted run, too; none is drawn where a row is missing.
         beside: images that the edit takes something from; percentiles and crops list them, too.
@@ -148,7 +143,13 @@ def write_images(
     if moving and moving == files and (given := [name for name, value in unused.items() if value]):
         raise ValueError(f"{moving[0]} is a video, which is drawn whole: leave out {', '.join(given)}")
     images_only = [file for file in files if file not in moving]
-    read, refused = readable(images_only, opener.read, progress, needed=not moving and not done)
+    needed = not moving and not done
+    read, refused = readable(images_only, opener.read, progress, needed)
+    if not force and (unsuitable := _unsuitable(read)):
+        refused |= unsuitable
+        read = {path: one for path, one in read.items() if str(path) not in unsuitable}
+        if needed and not read:
+            raise ValueError(": ".join(next(iter(unsuitable.items()))))
     shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
     shown = {file: row for file, row in shown.items() if not is_video(file)}
     with_sheet = len(shown) > 1 if sheet is None else sheet
@@ -243,6 +244,16 @@ def _copy_single(folder: Path, temporary: Path, out: Path) -> None:
             (still.convert("RGB") if kind == "JPEG" else still).save(temporary, format=kind, quality=95)
     else:
         shutil.copyfile(files[0], temporary)
+
+
+def _unsuitable(read: Mapping[Path, Read]) -> dict[str, str]:
+    """Why images do not suit the model, by path, with the bundled one that fits better."""
+    doubts = {path: framing["doubt"] for path, (_, _, framing, _) in read.items() if "doubt" in framing}
+    if not doubts:
+        return {}
+    better = fitting_better(np.stack([read[path][0] for path in doubts]))
+    help = "; ".join(filter(None, (better, "--frame auto looks for another part, --force draws it anyway")))
+    return {str(path): f"{doubt}; {help}" for path, doubt in doubts.items()}
 
 
 @contextmanager

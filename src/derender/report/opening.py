@@ -43,8 +43,8 @@ class OpenedImage:
     path: Path  # its file
     pixels: np.ndarray  # (3, S, S) uint8 at the model's size
     frame: Frame  # the part of the file that they show
-    # the same as JSON has it: beside the middle square, in pixels, and how it was found ("face", "auto",
-    # "none", or "no face" where one was looked for in vain)
+    # the same as JSON has it: beside the middle square, in pixels, how it was ``found`` (``FoundFrame.how``),
+    # and a ``doubt`` where it does not suit the model
     framing: Mapping[str, Any]
     scene: Scene  # one scene, on the model's device
     render: Callable[[Scene], Rendering]  # draws scenes like this one
@@ -108,10 +108,10 @@ class ImageOpener:
     def read(self, path: Path) -> Read:
         """Read a file; no image, or no face where one was asked for, is a ValueError or OSError."""
         photo = read_photo(path)
-        frame, result = found_frame(photo, self.model, self.options.frame)
+        frame, result, doubt = found_frame(photo, self.model, self.options.frame)
         middle = Frame.centred(photo.shape[1], photo.shape[0])
         place = {"x": frame.x, "y": frame.y, "side_px": frame.side, "roll_deg": frame.roll_deg}
-        framing = {**frame.within(middle), **place, "found": result}
+        framing = {**frame.within(middle), **place, "found": result, **({"doubt": doubt} if doubt else {})}
         pixels = frame.cut(photo, self.model.image_size)
         judged = middle.cut(photo, self.model.image_size) if result == "auto" else pixels
         return pixels, frame, framing, judged

@@ -54,7 +54,7 @@ class ImageOptions:
     texture: str | None = option(None, "Old spelling of detail.", hidden=True)
     fit_steps: int | None = option(
         None,
-        "Optimise each scene against its image in N steps; by default 20 for edits, else 0.",
+        "Optimise each scene against its image in N steps; by default 10 for edits, else 0.",
         min=0,
         max=10_000,
     )

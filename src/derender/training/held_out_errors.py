@@ -29,7 +29,7 @@ OUTLIER_PERCENTILE = 99.0
 """Images above it are called out-of-distribution."""
 EXPECTED_OUTLIERS = 0.1
 """Share of the images that may be; of held-out ones 0.01 are."""
-FITTING = 98.0
+FITTING = 90.0
 """A model is recommended where images have such a percentile, or less."""
 
 Images = UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"]
@@ -95,20 +95,25 @@ def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
     if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):
         return ""
+    which = "the image is" if len(percentiles) == 1 else f"{len(odd):,} of {len(percentiles):,} images are"
+    line = (
+        f"{which} reconstructed worse than {OUTLIER_PERCENTILE:g} % of those this model was validated on: "
+        "another kind of object, or another crop (derender align, --frame)"
+    )
+    return "; ".join(filter(None, (line, fitting_better(images[odd]))))
+
+
+def fitting_better(images: Images) -> str:
+    """The bundled model that reconstructs images best, with how well; empty where none does."""
     results = []
     for name in bundled_models():
         known, model = read_errors(model_folder(name)), load(name)
         if known is not None and model.image_size == images.shape[-1]:
-            results.append((float(np.median(reconstruction_percentile(model, images[odd], known))), name))
-    line = (
-        f"{len(odd):,} of {len(percentiles):,} images are reconstructed worse than {OUTLIER_PERCENTILE:g} % "
-        "of those this model was validated on: another kind of object, or another crop "
-        "(derender align, --frame)"
-    )
+            results.append((float(np.median(reconstruction_percentile(model, images, known))), name))
     worse, best = min(results, default=(100.0, ""))
-    if worse < FITTING:
-        return f"{line}; {best} fits better (worse than {worse:.0f} % of its own): try --model {best}"
-    return line
+    if worse >= FITTING:
+        return ""
+    return f"{best} fits better (worse than {worse:.0f} % of its own): try --model {best}"
 
 
 def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors:

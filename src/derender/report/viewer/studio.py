@@ -140,8 +140,8 @@ class Studio:
         looked_for = template_of(self.model) is not None and min(photo.shape[:2]) > self.model.image_size
         if faces and way in (None, "face"):
             return faces[0], "face"
-        frame, framed = found_frame(photo, self.model, "none" if looked_for and way is None else way)
-        return frame, "no face" if looked_for and way is None else framed
+        result = found_frame(photo, self.model, "none" if looked_for and way is None else way)
+        return result.frame, "no face" if looked_for and way is None else result.how
 
     def _decomposed(
         self, photo: np.ndarray, faces: tuple[Frame, ...], frame: Frame, framed: str, fit_steps: int,
