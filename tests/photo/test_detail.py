@@ -10,6 +10,7 @@ from derender import load
 from derender.data.synthetic import faces
 from derender.data.synthetic.settings import LIGHTS, VIEWS, FaceSettings
 from derender.photo import PhotoDetail
+from derender.photo.detail import _over_exposed
 from derender.render import render_scene
 from derender.renderers import renderer_named
 from derender.scene import Scene
@@ -46,6 +47,32 @@ def test_own_light_and_view_return_the_photograph(size, margin):
     seen = PhotoDetail(photo, scene, FOV, margin=margin)(scene)
     assert seen.image.shape == (1, 3, size, size)
     assert (seen.image[0] - photo).abs().max() <= 1 / 255
+
+
+def over_exposed_skin() -> torch.Tensor:
+    """(3, 1, 96, 96) skin, brighter to the right, past what can be shown; an eye's white on the left."""
+    skin = torch.tensor([1.0, 0.8, 0.65])[:, None, None] * torch.linspace(0.6, 1.5, LARGE)
+    skin = skin.repeat(1, LARGE, 1)[None]
+    skin[..., 40:44, 4:8] = 1.0
+    return skin
+
+
+def test_over_exposed_skin_has_the_colour_around_and_a_white_thing_stays_white():
+    true = over_exposed_skin()
+    lost = _over_exposed(true.clamp(max=1), 1.0)
+    known = true[0, 2, 40] <= 0.95  # where blue is not over-exposed it says all
+    assert (true.clamp(max=1) + lost - true)[0, :, 50, known & (torch.arange(LARGE) > 16)].abs().max() < 0.12
+    assert (lost[0, :, :, -1].diff(dim=0) < 0).all() and lost[..., 40:44, 4:8].max() == 0
+    assert not _over_exposed(true.clamp(max=0.9), 1.0).any()
+
+
+def test_over_exposed_photographs_keep_the_laws():
+    photo, scene = over_exposed_skin()[0].clamp(max=1), bump()
+    detail = PhotoDetail(photo, scene, FOV)
+    assert (detail(scene).image[0] - photo).abs().max() <= 1 / 255
+    dim = detail(scene.with_parameters(light=scene.light * torch.tensor([0.5, 0.5, 1, 1]))).image[0]
+    red, _, blue = dim[:, LARGE // 3 : -LARGE // 3, -LARGE // 3 : -LARGE // 5].mean(dim=(1, 2))
+    assert 1.2 < red / blue < 1.6  # 1.54 in truth, 1.0 to 1.15 in the photograph
 
 
 def test_twice_the_light_doubles_what_is_not_clipped():

@@ -10,7 +10,8 @@ New light falls on the object alone, whose outline GrabCut (Rother et al., SIGGR
 The more shading or view change, the more the model's colours weigh, after a change of shading in their smooth
 part: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
 as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
-and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays.
+and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays. Over-exposed
+skin darkens in the colour of the skin around it.
 """
 
 from math import atan, degrees, radians, tan
@@ -49,6 +50,10 @@ SMOOTH_SHARE = 0.012  # of the side: reach of the box filters over the depth tha
 SURE = 0.65  # of half the side: radius within which what faces the camera is the object
 LIKELY = (0.80, 0.60)  # of half the side: radius, and column, in which the search for its outline starts
 DARKEST = 1e-3
+CLIPPED = (0.96, 0.99)  # as FACING: up to the first a channel is well exposed, from the second it is not
+BRIGHT = (0.7, 0.9)  # of the colours around: below, what is over-exposed is another thing, as an eye's white
+DARKER = 0.9  # ratio of shading from which on over-exposed skin shows its colour in full
+FEW = 0.02  # weight of the object's mean colour among those around an over-exposed pixel
 LAMBERT = Renderer("lambert")
 
 
@@ -84,6 +89,7 @@ class PhotoDetail:
         self._place = project(points, self.wide, self.wide, self.wide_fov).permute(0, 3, 1, 2)
         self.renderer = renderer
         self._shading, self._veil = self._light(own), renderer.veil(own, self.wide_fov)
+        self._lost = _over_exposed(self.photo[None], self.span)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours, self._object = self._completed(own), self._found_object(own, points)
         at_home = self._warped(self._place, own)
@@ -200,8 +206,12 @@ class PhotoDetail:
         unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
         own = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift).permute(0, 3, 1, 2)
         places = (own[part] + unit * shift).permute(0, 2, 3, 1)
-        photo = self.photo.expand(len(shift), -1, -1, -1)
+        lost = (self._lost,) if bool(self._lost.any()) else ()
+        photo = torch.cat((self.photo[None], *lost), dim=1).expand(len(shift), -1, -1, -1)
         result = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
+        result, lost = result[:, :3], result[:, 3:]
+        if lost.shape[1]:
+            result = result + lost * _ramp(-ratio, -1, -DARKER)
         kept, beyond = result, 0.0
         if veil.shape[1]:
             clear = _cleared(result, veil)
@@ -232,11 +242,11 @@ class PhotoDetail:
         edge = spread * (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
         result = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
-        return result.clamp(0, 1)
+        return result.clamp(min=0)
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
-        photo = _look_up(self.on_grid(self.photo[None], self.grid), self._place - self.reach)
+        photo = _look_up(self.on_grid(self.photo[None] + self._lost, self.grid), self._place - self.reach)
         bare = (_cleared(photo, self._veil) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
         inner = self._seen * self._around(-COLOUR_MARGIN - FEATHER_SHARE, -COLOUR_MARGIN)
         weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)
@@ -312,6 +322,29 @@ def _facing(points: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n h w"]:
     along_u, along_v = torch.gradient(points, dim=2)[0], torch.gradient(points, dim=1)[0]
     normal = torch.linalg.cross(along_u, along_v)
     return (normal * points).sum(dim=-1) / (normal.norm(dim=-1) * points.norm(dim=-1)).clamp(min=1e-12)
+
+
+def _over_exposed(photo: Float[Tensor, "1 3 s s"], span: float) -> Float[Tensor, "1 3 s s"]:
+    """By how much channels would exceed 1, in the object's colours around, where they are over-exposed.
+
+    What is left of a pixel's channels says how bright that colour is; where none is, it is the least that
+    explains them.
+
+    Args:
+        photo: 0..1; the crop that the model was given is 1 / ``span`` of its side, in the middle.
+    """
+    clipped = _ramp(photo, *CLIPPED)
+    if not bool(clipped.any()):
+        return clipped
+    across = torch.linspace(-span, span, photo.shape[-1]).to(photo)
+    weight = _ramp(-torch.hypot(across, across[:, None]), -2 * SURE, -SURE)
+    weight = weight * (1 - clipped.amax(dim=1, keepdim=True)) * photo.mean(dim=1, keepdim=True) ** 3
+    mean = (weight * photo).sum(dim=(2, 3), keepdim=True) / weight.sum().clamp(min=DARKEST)
+    near = _blurred(torch.cat((weight * photo, weight), dim=1), COLOUR_SHARE * photo.shape[-1] / span)
+    colour = ((near[:, :3] + FEW * mean) / (near[:, 3:] + FEW)).clamp(min=DARKEST)
+    brightest = colour.amax(dim=1, keepdim=True)
+    brighter = colour * (photo / colour).amax(dim=1, keepdim=True)
+    return clipped * _ramp(brightest, *BRIGHT) * (brighter - photo).clamp(0, 1)
 
 
 def _ramp(value: Tensor, low: float, high: float) -> Tensor:
