@@ -103,7 +103,7 @@ def clean(text: str) -> str:
 
 def setting_tables() -> Iterator[str]:
     """A table for each class of settings: name, default, range or choice, the comment beside it."""
-    from derender.evaluation.segmentation.nets import SegmentSettings
+    from derender.evaluation.segmenters import SegmentSettings
     from derender.training.config import PRESETS, FinetuneConfig, TrainConfig
     from derender.training.distillation import RefineConfig
     from derender.training.unets import UNetSettings

@@ -12,7 +12,7 @@ PAGE = (ROOT / "docs" / "reference" / "metrics.md").read_text()
 TABLES = (
     *("evaluation/clustering", "evaluation/clustering_scores", "evaluation/linear_probing"),
     *("evaluation/paper_tables", "evaluation/score_table", "evaluation/disentanglement/card"),
-    *("evaluation/segmentation/compare", "evaluation/robust/compare"),
+    *("evaluation/segmentation", "evaluation/robust"),
     *("evaluation/depth", "evaluation/factors", "evaluation/pixels"),
 )
 

@@ -4,7 +4,7 @@ import copy
 
 import torch
 
-from derender.evaluation.segmentation.nets import SegmentationNet
+from derender.evaluation.segmenters import SegmentationNet
 from derender.networks import NetworkSettings
 from derender.networks.encoders import UNetDecoder, UNetEncoder, pixel_decoder
 

@@ -16,8 +16,7 @@ from matplotlib.colors import hsv_to_rgb
 from PIL import Image, ImageDraw, ImageFont
 
 from derender.evaluation.memory import content_hash
-from derender.evaluation.robust import CurveResult, RobustnessComparison
-from derender.evaluation.robust.compare import SCORES, level_name
+from derender.evaluation.robust import SCORES, CurveResult, RobustnessComparison, level_name
 from derender.evaluation.segmentation import SegmentationComparison
 from derender.report import colours
 from derender.report.charts import SERIES, side_by_side

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from derender.evaluation.linear_task import task_of
-from derender.evaluation.robust import compare_robustness
-from derender.evaluation.robust.compare import area_under
-from derender.evaluation.robust.trial import Curve, Trial
+from derender.evaluation.robust import area_under, compare_robustness
+from derender.evaluation.trials import Curve, Trial
 
 PEOPLE, EACH = 4, 10
 LEVELS = (0.0, 30.0, 60.0)

@@ -9,10 +9,10 @@ import torch
 
 from derender import Derenderer
 from derender.data import ImageSet
+from derender.evaluation import trials
 from derender.evaluation.linear_task import task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.robust import trial as trials
-from derender.evaluation.robust.trial import Recipe, chosen_axes
+from derender.evaluation.trials import Recipe, chosen_axes
 from derender.render import render_scene
 
 YAW, LIGHT = chosen_axes(["yaw", "light"])

@@ -11,11 +11,17 @@ from torchmetrics.functional.classification import multiclass_accuracy, multicla
 
 from derender import Derenderer
 from derender.evaluation.memory import Memory
-from derender.evaluation.segmentation import VARIANTS, SegmentSettings, compare, divide, segment
-from derender.evaluation.segmentation import data as controls
-from derender.evaluation.segmentation.compare import count_pixels, resampled_scores
-from derender.evaluation.segmentation.data import by_components
-from derender.evaluation.segmentation.nets import answer, build_variant, train_segmenter
+from derender.evaluation.segmentation import COLUMNS, class_iou, count_pixels, resampled_scores, segment
+from derender.evaluation.segmenters import (
+    VARIANTS,
+    SegmentSettings,
+    answer,
+    build_variant,
+    by_components,
+    divide,
+    most_frequent_at_place,
+    train_segmenter,
+)
 
 DOUBLE = np.ones((2, 2), np.uint8)
 QUICK = SegmentSettings(learning_rate=1e-2, epochs=6, batch_size=4)
@@ -28,7 +34,7 @@ def mean_iou(answers, data) -> float:
 
 def test_controls_answer_what_they_may_know(data):
     truth = data.masks[data.test]
-    place = controls.most_frequent_at_place(data)
+    place = most_frequent_at_place(data)
     column = [np.bincount(data.masks[data.train, row, 7]).argmax() for row in range(32)]
     assert (place == place[0]).all() and (place[0, :, 7] == column).all()
     blind = replace(data, images=np.full_like(data.images, 90))
@@ -141,8 +147,8 @@ def test_bad_input_is_named(data, model):
 def scores(answers, masks, n_classes=4) -> SimpleNamespace:
     counts = count_pixels(np.asarray(answers), np.asarray(masks), n_classes)
     values = resampled_scores(counts, np.ones((1, len(counts))))[0]
-    named = dict(zip(compare.COLUMNS, values, strict=True))
-    return SimpleNamespace(**named, class_iou=compare.class_iou(counts))
+    named = dict(zip(COLUMNS, values, strict=True))
+    return SimpleNamespace(**named, class_iou=class_iou(counts))
 
 
 def test_a_class_that_no_mask_shows_is_left_out_for_every_answer():

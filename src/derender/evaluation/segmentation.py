@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 
 from derender.data import read_masks
+from derender.evaluation import segmenters
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, once_and_resampled, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
 from derender.evaluation.pixels import evenly
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, scored_table, verdict_table
-from derender.evaluation.segmentation import nets
-from derender.evaluation.segmentation.data import CONTROLS, TEST_FRACTION, SegmentationData, divide
-from derender.evaluation.segmentation.nets import SegmentSettings
+from derender.evaluation.segmenters import TEST_FRACTION, SegmentationData, SegmentSettings, divide
 from derender.features import model_fingerprint
 from derender.features.extract import check_size
 from derender.inputs import as_model
@@ -161,7 +160,7 @@ def segment(
         ValueError: the model has no U-Net encoders, or images of another size.
     """
     model, report = as_model(model), progress or (lambda *_: None)
-    chosen, notes = nets.chosen_variants(model, variants), []
+    chosen, notes = segmenters.chosen_variants(model, variants), []
     if not len(seeds):
         raise ValueError("a comparison needs at least one seed")
     if not isinstance(data, SegmentationData):
@@ -188,8 +187,8 @@ def segment(
         def step(seen: int, loss: float) -> None:
             report(done + seen, total, f"{run}, seed {seed}, loss {loss:.2f}")
 
-        losses = nets.train_segmenter(net, data, seed, settings, step)
-        return {**counted(nets.answer(net, data.images[data.test])), "losses": np.array(losses)}
+        losses = segmenters.train_segmenter(net, data, seed, settings, step)
+        return {**counted(segmenters.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
     weights = once_and_resampled(len(data.test), resample_count)
 
@@ -204,7 +203,7 @@ def segment(
     for name, variant in chosen.items():
         runs, trainable = [], 0
         for seed in seeds:
-            net = nets.build_variant(model, variant, data, seed)
+            net = segmenters.build_variant(model, variant, data, seed)
             trainable = sum(p.numel() for p in net.parameters() if p.requires_grad)
             inputs = {
                 "start": model_fingerprint(net), "frozen": variant.frozen, "seed": seed, **same,
@@ -216,7 +215,7 @@ def segment(
             report(done, total, name)
         rows.append(row(variant.title, not variant.pretrained, runs, trainable))
     apart = Memory(memory.folder)  # controls are cached as well, but are no runs
-    for title, control in CONTROLS.items():
+    for title, control in segmenters.CONTROLS.items():
         made = partial(lambda control: counted(control(data)), control)
         run = apart.recall("segment-control", {**same, "control": title}, made)
         rows.append(row(title, True, [run], 0))

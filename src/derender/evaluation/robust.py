@@ -15,13 +15,11 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from derender.data import ImageSet
-from derender.evaluation import bootstrap, feature_rows
+from derender.evaluation import bootstrap, feature_rows, trials
 from derender.evaluation.linear_probes import PROBES, majority_answers, probe_runs
 from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.robust import trial as trials
-from derender.evaluation.robust.trial import LEVELS, Curve, Trial
 from derender.evaluation.score_table import (
     Column,
     Row,
@@ -31,6 +29,7 @@ from derender.evaluation.score_table import (
     verdict,
     verdict_table,
 )
+from derender.evaluation.trials import LEVELS, Curve, Trial
 from derender.features import FeatureTable, named, table_labels
 from derender.inputs import Progress, as_model
 
