@@ -49,4 +49,4 @@ def finetune(
     result(f"model {made.run.folder}", published.json_file)
     result(f"report {out / 'report.html'}", published.json_file)
     values = {"run": made.run, "report": out / "report.html", "scores": made.scores.values}
-    published.publish(replace(made.scores, values=values), memory)
+    published.publish(replace(made.scores, values=values, notes=[*made.scores.notes, memory.summary()]))

@@ -14,7 +14,6 @@ from derender.cli.options import option
 
 if TYPE_CHECKING:
     from derender.evaluation.feature_rows import FeatureSource
-    from derender.evaluation.memory import Memory
     from derender.evaluation.score_table import Scores
 
 number = partial(option, min=1, metavar="N")
@@ -110,9 +109,7 @@ class Published:
                 raise ValueError(f"--out {out} must end in {', '.join(forms)}: the kind of drawing")
             refuse_existing_file(out, self.force)
 
-    def publish(
-        self, scores: "Scores", memory: "Memory | None" = None, what: str = "results", **values: Any
-    ) -> None:
+    def publish(self, scores: "Scores", **values: Any) -> None:
         """Show tables and notes, and write every form that was requested; ``values`` are further numbers."""
         from derender.storage.atomic import write_whole
 
@@ -120,8 +117,6 @@ class Published:
         if (half := values.get("half", "all")) != "all":
             tables = [replace(one, caption=f"{one.caption}; {half} half") for one in tables]
             scores = replace(scores, tables=tables)
-        if memory is not None:
-            notes.append(memory.summary(what))
         for table in tables:
             show_scores(table, self.json_file)
         for note in notes:

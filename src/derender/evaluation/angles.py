@@ -113,7 +113,7 @@ def _angles(
     what: str, model: Any, images: Any, table: Any, fit_steps: int | None, options: Mapping[str, Any]
 ) -> Scores:
     labels = POSE if what == "Pose" else LIGHT
-    how = Options(images=images, **{"keep_duplicates": True, **options})
+    how = Options.of(options, images=images, keep_duplicates=True)
     model = as_model(model, device=how.device)
     true, read = known_angles(how.at(model.image_size), table, labels)
     nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}

@@ -67,7 +67,7 @@ def cluster(
     Raises:
         ValueError: labels, factors or images do not fit.
     """
-    how = Options(**{"descriptors": label in ("identity", ["identity"], "class", ["class"]), **options})
+    how = Options.of(options, descriptors=label in ("identity", ["identity"], "class", ["class"]))
     rows = subject_and_controls(features, how)
     names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
     mean_by = (mean_by,) if isinstance(mean_by, str) else mean_by

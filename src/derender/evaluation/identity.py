@@ -57,7 +57,7 @@ def identify(
     """
     if list(bins) != sorted(set(bins)):
         raise ValueError(f"bins must grow, got {', '.join(map(str, bins))}")
-    how = Options(**{"keep_duplicates": True, "descriptors": True, **options})
+    how = Options.of(options, keep_duplicates=True, descriptors=True)
     rows = subject_and_controls(features, how)
     ready = prepare(rows, [label])
     who, table = ready.labels[label].astype(str), ready.table
@@ -205,7 +205,7 @@ def verify(
     """
     pairs = pairs if isinstance(pairs, Pairs) else read_pairs(pairs)
     pairs = _in_half(pairs, half)
-    how = Options(**{"keep_duplicates": True, "descriptors": True, **options})
+    how = Options.of(options, keep_duplicates=True, descriptors=True)
     names = {*pairs.first, *pairs.second}
     if is_model(features):
         features = as_model(features, device=how.device)

@@ -91,7 +91,7 @@ def linear(
         named(probes.PROBES, head, "head")
     if finetune and not feature_rows.is_model(features):
         raise ValueError("finetune trains the encoders: give a model and images")
-    how = Options(untrained_seeds=untrained_seeds, **options)
+    how = Options.of(options, untrained_seeds=untrained_seeds)
     rows = feature_rows.subject_and_controls(features, how)
     names, left_out = feature_rows.chosen_labels(rows[0].tables[0], label, attributes, least=2)
     ready = feature_rows.prepare(rows, names, min_count=min_count, max_count=max_count)

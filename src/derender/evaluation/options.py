@@ -1,6 +1,6 @@
-"""How protocols on features run: one frozen value, whose fields are keywords of every such protocol."""
+"""How protocols run: one frozen value, whose fields are keywords of every protocol."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,11 +16,13 @@ from derender.inputs import Progress, as_images
 DEFAULT_FACTORS = ("geometry", "albedo")
 NAMED = 5
 """So many skipped images are named."""
+FORMER = {"resample_count": "resamples", "memory": "cache"}
+"""Former keywords of some protocols, which are taken still, and today's."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Keywords of every protocol on features.
+    """Keywords of every protocol; those on single images use seed, resamples, reading, cache and progress.
 
     Attributes:
         images: a data set or its address: of models, and of the controls. Without it there are no pixels, PCA
@@ -53,6 +55,11 @@ class Options:
     progress: Callable[..., object] | None = None
     notes: list[str] = field(default_factory=list, init=False)
     _read: dict[int, ImageSet] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any], **defaults: Any) -> "Options":
+        """The keywords of a call, over defaults of its protocol."""
+        return cls(**{**defaults, **{FORMER.get(name, name): value for name, value in given.items()}})
 
     @cached_property
     def memory(self) -> Memory:

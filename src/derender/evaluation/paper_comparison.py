@@ -28,7 +28,6 @@ from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, besid
 from derender.evaluation.score_table import Column, Scores, ScoreTable, interval_column, interval_of
 from derender.evaluation.segmentation import SegmentSettings, segment
 from derender.features import named
-from derender.inputs import as_model
 
 PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
 
@@ -65,7 +64,7 @@ def compare(
         ValueError: an unknown table, or labels, factors or images that do not fit.
     """
     spec = named(TABLES, table, "table")
-    how = Options(**{"images": images, "descriptors": table == "identity", **options})
+    how = Options.of(options, images=images, descriptors=table == "identity")
     models = {name: [run for run in runs_of(runs) if is_model(run)] for name, runs in features.items()}
     models = {name: runs for name, runs in models.items() if runs}
     numbers = {"table": table, "number": spec.number}
@@ -80,10 +79,9 @@ def compare(
             if others:
                 raise ValueError(f"two models have the name {name!r}: give each its own")
             result = segment(
-                as_model(model, device=how.device), images, masks=masks, dataset=how.dataset,
-                limit=how.limit, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
-                settings=SegmentSettings(epochs=epochs), resample_count=how.resamples, memory=how.memory,
-                progress=how.progress,
+                model, images, masks=masks, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
+                settings=SegmentSettings(epochs=epochs), dataset=how.dataset, limit=how.limit,
+                device=how.device, resamples=how.resamples, cache=how.memory, progress=how.progress,
             )  # fmt: skip
             shown = (result.tables[-1], *result.tables[:-1])
             tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]

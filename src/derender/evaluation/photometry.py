@@ -66,7 +66,7 @@ def brightness(
     Raises:
         ValueError: the set has no true albedo, or the label fewer than two groups.
     """
-    how = Options(images=images, **options)
+    how = Options.of(options, images=images)
     model = as_model(model, device=how.device)
     nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
     if by is not None:
@@ -198,7 +198,7 @@ def relight(
     Raises:
         ValueError: the images lack identity or light, or no two people share two lights.
     """
-    how = Options(images=images, **{"keep_duplicates": True, **options})
+    how = Options.of(options, images=images, keep_duplicates=True)
     model = as_model(model, device=how.device)
     read = how.at(model.image_size)
     if lacking := [name for name in NEEDED if name not in read.labels]:

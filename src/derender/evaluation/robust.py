@@ -86,7 +86,7 @@ def robustness(
     Returns:
         The tables; ``result`` is the ``RobustnessComparison``.
     """
-    how = Options(images=images, untrained_seeds=untrained_seeds, **options)
+    how = Options.of(options, images=images, untrained_seeds=untrained_seeds)
     way = pictures or ("faces" if images is None else "render")
     named(dict.fromkeys(WAYS), way, "kind of images")
     named(SCORES, score, "score")

@@ -16,11 +16,11 @@ import numpy as np
 
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_ground_truth
-from derender.evaluation.bootstrap import RESAMPLES, numbers_of
+from derender.evaluation.bootstrap import numbers_of
 from derender.evaluation.depth import GeometryResult, evaluate_geometry
 from derender.evaluation.factors import FactorResult, evaluate_factors
 from derender.evaluation.image_scores import ImageResult, image_verdicts
-from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
 from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, evenly, mean_image
 from derender.evaluation.score_table import Scores
 from derender.features import Progress, embed_images, model_fingerprint
@@ -36,11 +36,8 @@ def geometry(
     truth: GroundTruth | str | Path,
     *,
     fit_steps: int | None = None,
-    resample_count: int = RESAMPLES,
-    seed: int = 0,
     batch_size: int = 64,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Scores:
     """Is the geometry the true one? SIDE and MAD on rendered images with exact depth, beside controls.
 
@@ -51,27 +48,27 @@ def geometry(
         truth: images with exact depth at the model's size, or the path of a rendered set, or of folders
             image/ and depth/ with PNGs.
         fit_steps: steps of per-image optimisation; None or 0 for none.
-        resample_count: bootstrap resamples of the images.
-        seed: of the untrained model's weights.
         batch_size: images at a time; changes speed and memory only.
-        memory: cache of the scores.
-        progress: called with (images done, images in all).
+        options: seed (of the untrained weights), resamples, limit, device, cache, progress: fields of
+            ``Options``.
     """
-    model = as_model(model)
-    exact = truth if isinstance(truth, GroundTruth) else read_ground_truth(truth, image_size=model.image_size)
+    how = Options.of(options)
+    model = as_model(model, device=how.device)
+    exact = truth
+    if not isinstance(exact, GroundTruth):
+        exact = read_ground_truth(exact, limit=how.limit, image_size=model.image_size)
     names = ("images", "depth", "mask", "normal", "albedo", "light", "camera")
     known = {name: getattr(exact, name) for name in names if getattr(exact, name) is not None}
     scored = optimised(model, fit_steps)
-    how: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, seed)}
-    again = partial(evaluate_reconstruction, scored, exact.images, components_of=exact.images, **how)
+    same: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, how.seed)}
+    again = partial(evaluate_reconstruction, scored, exact.images, components_of=exact.images, **same)
     protocols: Protocols = {
-        "geometry": (GeometryResult, partial(evaluate_geometry, scored, exact, progress=progress, **how))
+        "geometry": (GeometryResult, partial(evaluate_geometry, scored, exact, progress=how.progress, **same))
     }
     if {"albedo", "light", "camera"} <= set(known):
-        protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **how)
+        protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **same)
     protocols["reconstruction"] = ReconstructionResult, again
-    inputs = {**known, "seed": seed, "steps": fit_steps or 0}
-    result = _scored(model, protocols, inputs, resample_count, memory)
+    result = _scored(model, protocols, {**known, "seed": how.seed, "steps": fit_steps or 0}, how)
     if isinstance(factors := result.values.get("factors"), FactorResult):
         parts = {"factors": replace(factors, untrained=None), "factors_untrained": factors.untrained}
         result = replace(result, values={**result.values, **parts})
@@ -84,11 +81,8 @@ def reconstruction(
     *,
     training_images: ImageSet | None = None,
     fit_steps: int | None = None,
-    resample_count: int = RESAMPLES,
-    seed: int = 0,
     batch_size: int = 64,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Scores:
     """How well are images reconstructed? L1, PSNR and SSIM inside the mask, beside controls.
 
@@ -98,42 +92,37 @@ def reconstruction(
         model: a model, or the name or folder of one.
         images: an image set at the model's size, or the path of a data set; best unseen in training.
         training_images: give the mean image and the components (of at most 2,000); by default ``images``.
-        fit_steps, resample_count, seed, batch_size, memory, progress: as of ``geometry``.
+        fit_steps, batch_size, options: as of ``geometry``.
     """
-    model = as_model(model)
-    images = as_images(images, model.image_size)
+    how = Options.of(options)
+    model = as_model(model, device=how.device)
+    images = as_images(images, model.image_size, dataset=how.dataset, limit=how.limit)
     known = (training_images or images).images
 
     def make() -> ReconstructionResult:
         return evaluate_reconstruction(
             optimised(model, fit_steps), images.images, mean=mean_image(known),
-            components_of=known[evenly(len(known))], untrained=untrained_twin(model, seed),
-            batch_size=batch_size, progress=progress,
+            components_of=known[evenly(len(known))], untrained=untrained_twin(model, how.seed),
+            batch_size=batch_size, progress=how.progress,
         )  # fmt: skip
 
-    inputs = {"images": images.images, "fitted": known, "seed": seed, "steps": fit_steps or 0}
-    result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, resample_count, memory)
+    inputs = {"images": images.images, "fitted": known, "seed": how.seed, "steps": fit_steps or 0}
+    result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, how)
     intervals = result.values["intervals"]["reconstruction"]
     return replace(result, values={**result.values, "intervals": intervals})
 
 
-def _scored(
-    model: Derenderer,
-    protocols: Protocols,
-    inputs: Mapping[str, Any],
-    resample_count: int,
-    memory: Memory | None,
-) -> Scores:
+def _scored(model: Derenderer, protocols: Protocols, inputs: Mapping[str, Any], how: Options) -> Scores:
     """Results of protocols, from the cache if the same model and inputs gave them before."""
-    settings, kept = model.settings.model_dump(mode="json"), memory or Memory()
+    settings = model.settings.model_dump(mode="json")
     inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
-    result = {name: kept.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
-    rows = {name: one.rows(resample_count) for name, one in result.items()}
+    result = {name: how.memory.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
+    rows = {name: one.rows(how.resamples) for name, one in result.items()}
     notes = [note for name, one in result.items() for note in image_verdicts(rows[name][0], one.columns)]
     intervals = {name: numbers_of(scored) for name, scored in rows.items()}
     values = {"pictures": len(inputs["images"]), **result, "intervals": intervals}
     tables = [one.table(rows[name]) for name, one in result.items()]
-    return Scores(tables, values, notes, result=next(iter(result.values())))
+    return Scores(tables, values, [*notes, how.memory.summary()], result=next(iter(result.values())))
 
 
 def optimised(model: Derenderer, steps: int | None) -> Derenderer:

@@ -8,7 +8,7 @@ image by image and added up before they are divided. A class that no tested mask
 mean; answering it still costs the classes whose pixels it takes. Leaves out boundary scores.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,9 @@ import numpy as np
 
 from derender.data import read_masks
 from derender.evaluation import segmenters
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, once_and_resampled, scored_row, with_verdicts
+from derender.evaluation.bootstrap import ScoredRow, once_and_resampled, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
+from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
 from derender.evaluation.pixels import evenly
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, scored_table, verdict_table
@@ -37,9 +38,6 @@ COLUMNS = {
 }
 """By score, all best at 1. ``top10_iou`` is higher by selection alone; background, skin and hair decide
 ``pixel_accuracy``."""
-
-Progress = Callable[[int, int, str], object]
-"""Called with (images seen in all runs, images in all, the current run)."""
 
 
 @dataclass(frozen=True)
@@ -128,16 +126,12 @@ def segment(
     data: SegmentationData | str | Path,
     *,
     masks: str | Path | None = None,
-    dataset: str = "auto",
-    limit: int | None = None,
     test_fraction: float = TEST_FRACTION,
     labelled: int | None = None,
     variants: Sequence[str] | None = None,
     seeds: Sequence[int] = (0, 1, 2),
     settings: SegmentSettings | None = None,
-    resample_count: int = RESAMPLES,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Scores:
     """Do pre-trained U-Net encoders help segmentation? Variants trained once a seed beside controls.
 
@@ -145,13 +139,12 @@ def segment(
         model: with U-Net encoders (or the name or folder of one); stays as it was.
         data: divided images of the model's size with masks, or the path of a data set with masks.
         masks: folder or zip of masks named as the images, where the path has none.
-        dataset, limit, test_fraction, labelled: of a path, as in ``read_masks`` and ``divide``.
+        test_fraction, labelled: of a path, as in ``divide``.
         variants: names of ``VARIANTS``, the subject of the table first; by default all the model allows.
         seeds: of fresh weights and orders.
         settings: of the training.
-        resample_count: bootstrap resamples of the tested images.
-        memory: cache of the runs.
-        progress: called after every step.
+        options: dataset, limit, device, resamples, cache, progress: fields of ``Options``; progress is called
+            after every step with (images seen in all runs, images in all, the current run).
 
     Returns:
         The tables; ``result`` is the ``SegmentationComparison``.
@@ -159,19 +152,20 @@ def segment(
     Raises:
         ValueError: the model has no U-Net encoders, or images of another size.
     """
-    model, report = as_model(model), progress or (lambda *_: None)
+    how = Options.of(options)
+    model, report = as_model(model, device=how.device), how.progress or (lambda *_: None)
     chosen, notes = segmenters.chosen_variants(model, variants), []
     if not len(seeds):
         raise ValueError("a comparison needs at least one seed")
     if not isinstance(data, SegmentationData):
         read = read_masks(
-            data, model.image_size, masks=masks, dataset=dataset, limit=limit,
+            data, model.image_size, masks=masks, dataset=how.dataset, limit=how.limit,
             progress=lambda done, total: report(done, total, "reading"),
         )  # fmt: skip
         notes.append(read[0].describe())
         data = divide(*read, test_fraction=test_fraction, split_seed=seeds[0], labelled=labelled)
     check_size(model, data.images)
-    settings, memory = settings or SegmentSettings(), memory or Memory()
+    settings = settings or SegmentSettings()
     settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
     shown = data.test[evenly(len(data.test), SHOWN)]
     content = content_hash({name: getattr(data, name) for name in ("images", "masks", "train", "test")})
@@ -190,7 +184,7 @@ def segment(
         losses = segmenters.train_segmenter(net, data, seed, settings, step)
         return {**counted(segmenters.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
-    weights = once_and_resampled(len(data.test), resample_count)
+    weights = once_and_resampled(len(data.test), how.resamples)
 
     def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
         result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
@@ -210,11 +204,11 @@ def segment(
                 "settings": settings.model_dump(mode="json"), "decoder": variant.decoder,
                 "statistics": variant.frozen or variant.pretrained,
             }  # fmt: skip
-            runs.append(memory.recall(f"segment-{name}", inputs, partial(trained, net, seed, name)))
+            runs.append(how.memory.recall(f"segment-{name}", inputs, partial(trained, net, seed, name)))
             done += each
             report(done, total, name)
         rows.append(row(variant.title, not variant.pretrained, runs, trainable))
-    apart = Memory(memory.folder)  # controls are cached as well, but are no runs
+    apart = Memory(how.memory.folder)  # controls are cached as well, but are no runs
     for title, control in segmenters.CONTROLS.items():
         made = partial(lambda control: counted(control(data)), control)
         run = apart.recall("segment-control", {**same, "control": title}, made)
@@ -222,7 +216,8 @@ def segment(
     judged = zip(rows, with_verdicts([row.scored for row in rows]), strict=True)
     compared = tuple(replace(row, scored=scored) for row, scored in judged)
     result = SegmentationComparison(compared, data, tuple(seeds), settings, shown)
-    return Scores(result.tables(), {"data": data.source, **result.numbers()}, notes, result=result)
+    values = {"data": data.source, **result.numbers()}
+    return Scores(result.tables(), values, [*notes, how.memory.summary("runs")], result=result)
 
 
 def count_pixels(answers: np.ndarray, masks: np.ndarray, n_classes: int) -> np.ndarray:

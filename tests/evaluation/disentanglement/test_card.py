@@ -26,7 +26,7 @@ def lit_pictures(count: int = 60) -> ImageSet:
 
 def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
     net, pictures, steps = model(), lit_pictures(), []
-    how = {"seeds": (0, 1), "progress": lambda *at: steps.append(at)}
+    how = {"seeds": (0, 1), "cache": "none", "progress": lambda *at: steps.append(at)}
     card = disentangle(net, pictures, swap_images=8, **how).result
     assert list(card.rows) == ["model", "untrained encoder", "shuffled rows", "random pixels", "PCA"]
     assert all(len(results) == 2 for results in card.rows.values()) and steps[-1] == (10, 10)
@@ -40,7 +40,7 @@ def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
     assert ours.truth is not None and ours.truth.by_dimension is not None and shuffled.truth is not None
     assert ours.truth.by_feature.informativeness > 0.8 > 0.2 > shuffled.truth.by_feature.informativeness
     assert ours.similarity.mean_cross_r2 > 0.5 > 0.1 > shuffled.similarity.mean_cross_r2
-    again = disentangle(net, pictures, seeds=(0,), swap_images=8, dimensions=None).result
+    again = disentangle(net, pictures, seeds=(0,), swap_images=8, dimensions=None, cache="none").result
     same = again.rows["untrained encoder"][0]
     assert same.swap is not None and same.swap.ratio == pytest.approx(untrained.swap.ratio, rel=1e-5)
     assert same.truth is not None and same.truth.by_dimension is None
@@ -49,7 +49,7 @@ def test_the_card_holds_the_model_and_every_control_and_repeats_itself():
 def test_without_true_factors_only_their_part_is_missing():
     pictures = lit_pictures(20)
     real = ImageSet(pictures.images, pictures.files, {"age": pictures.labels["light_yaw_rad"]})
-    card = disentangle(model(), real, seeds=(0,), swap_images=4).result
+    card = disentangle(model(), real, seeds=(0,), swap_images=4, cache="none").result
     scores = card.rows["model"][0]
     assert scores.truth is None and np.isfinite(scores.pearson.mean_per_dimension)
     with pytest.raises(ValueError, match="at least one seed"):

@@ -29,13 +29,11 @@ def disentangle(
 ) -> None:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
     published.check_drawing(out, [".png"])
-    from derender.evaluation.memory import memory_in
-
-    model, memory = trained.open(), memory_in(cache)
+    model = trained.open()
     chosen = images.read(model.image_size, model=trained.model)
     scores = scoring.measured(
         "disentangle", model, chosen, seeds=range(seed, seed + seeds), swap_images=swap_pictures,
-        dimensions=None if dimensions == "none" else dimensions, batch_size=batch_size, memory=memory,
+        dimensions=None if dimensions == "none" else dimensions, batch_size=batch_size, cache=cache,
         unit="steps",
     )  # fmt: skip
     if out is not None:
@@ -43,4 +41,4 @@ def disentangle(
 
         write_card(scores.result, f"{trained.model}: {len(chosen):,} images", out)
         result(f"matrices in {out}", published.json_file)
-    published.publish(scores, memory)
+    published.publish(scores)

@@ -18,16 +18,11 @@ def geometry(
 
     Images: a rendered set (as from derender synth), or folders image/ and depth/ with PNGs side by side.
     """
-    from derender.data import read_ground_truth
-    from derender.evaluation.memory import memory_in
-
-    model, memory = trained.open(), memory_in(cache)
-    truth = read_ground_truth(images.address, limit=images.limit, image_size=model.image_size)
     scores = scoring.measured(
-        "geometry", model, truth, fit_steps=fit_steps, resample_count=resamples, seed=seed,
-        batch_size=batch_size, memory=memory, doing="decomposing",
+        "geometry", trained.open(), images.address, limit=images.limit, fit_steps=fit_steps, seed=seed,
+        resamples=resamples, batch_size=batch_size, cache=cache, doing="decomposing",
     )  # fmt: skip
-    published.publish(scores, memory)
+    published.publish(scores)
 
 
 def reconstruction(
@@ -40,20 +35,19 @@ def reconstruction(
 
     These are the mean image, 64 principal components of the pixels, and an untrained model.
     """
-    from derender.evaluation.memory import memory_in
     from derender.inputs import part_of
     from derender.storage.places import model_folder
     from derender.training.held_out_errors import errors_of, write_errors
 
-    model, memory = trained.open(), memory_in(cache)
+    model = trained.open()
     known = replace(images, part="all").read(model.image_size)
     chosen = part_of(known, images.part, trained.model)
     learned = known if images.part == "all" else part_of(known, "train", trained.model)
     scores = scoring.measured(
         "reconstruction", model, chosen, training_images=learned, fit_steps=fit_steps,
-        resample_count=resamples, seed=seed, batch_size=batch_size, memory=memory, doing="rendering",
+        resamples=resamples, seed=seed, batch_size=batch_size, cache=cache, doing="rendering",
     )  # fmt: skip
-    published.publish(scores, memory, part=images.part)
+    published.publish(scores, part=images.part)
     if store:
         file = write_errors(model_folder(trained.model), errors_of(model, chosen.images, batch_size))
         notice(f"errors of {len(chosen):,} images stored in {file}")

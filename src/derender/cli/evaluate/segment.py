@@ -27,18 +27,16 @@ def segment(
     it, in the user's cache): the same command continues with the next run. Overlays show the images
     themselves: consider who is on them before you share the folder.
     """
-    from derender.evaluation.memory import memory_in
     from derender.evaluation.segmentation import SegmentSettings
 
-    memory = memory_in(None if out is None else str(out / "runs"))
     scores = scoring.measured(
         "segment", trained.open(), images.address, **images.how, masks=masks, test_fraction=test_fraction,
         labelled=labelled, variants=scoring.names_of(variants), seeds=range(seed, seed + seeds),
-        resample_count=resamples, settings=SegmentSettings(epochs=epochs, batch_size=batch_size),
-        memory=memory, doing="training",
+        resamples=resamples, settings=SegmentSettings(epochs=epochs, batch_size=batch_size),
+        cache=None if out is None else out / "runs", doing="training",
     )  # fmt: skip
     if out is not None:
         from derender.report.protocols import write_overlays
 
         result(f"overlays {write_overlays(scores.result, out)}", published.json_file)
-    published.publish(scores, memory, "runs", model=trained.model)
+    published.publish(scores, model=trained.model)

@@ -31,11 +31,11 @@ from derender.evaluation.disentanglement.similarity import (
     similarity,
 )
 from derender.evaluation.disentanglement.swap import SwapScores, swap_test
-from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
 from derender.evaluation.score_table import Cell, Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
 from derender.features.table import check_finite
-from derender.inputs import Progress, as_images, as_model
+from derender.inputs import as_images, as_model
 
 MODEL = "model"
 MIN_IMAGES = 20
@@ -200,8 +200,7 @@ def disentangle(
     dimensions: str | None = "lasso",
     swap_images: int = 256,
     batch_size: int = 64,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Scores:
     """Does each feature hold its own factor? Correlation, CKA, the swap test; on rendered data DCI, MIG, SAP.
 
@@ -213,14 +212,15 @@ def disentangle(
         dimensions: importances of the scores by dimension, "lasso"; None leaves these scores out.
         swap_images: at most so many images, a random subset for each seed, go through the swap test.
         batch_size: images at a time; changes speed and memory only.
-        memory: cache of the scores of each row and seed.
-        progress: called with (steps done, steps in all).
+        options: limit, device, cache, progress: fields of ``Options``.
 
     Returns:
         The tables; ``result`` is the ``DisentanglementCard``.
     """
-    model, kept = as_model(model), memory or Memory()
-    images = as_images(images, model.image_size).require(MIN_IMAGES, "the disentanglement card")
+    how = Options.of(options)
+    model, kept = as_model(model, device=how.device), how.memory
+    images = as_images(images, model.image_size, dataset=how.dataset, limit=how.limit)
+    images.require(MIN_IMAGES, "the disentanglement card")
     if not seeds:
         raise ValueError("the card needs at least one seed")
     pixels, (factors, unused) = images.images, true_factors(images.labels)
@@ -269,8 +269,8 @@ def disentangle(
             keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_images}
             make = partial(made, name, seed)
             result.append(kept.recall_value("card", {**inputs, **keys}, FeatureScores, make))
-            if progress is not None:
-                progress(sum(map(len, rows.values())), len(seeds) * len(rows))
+            if how.progress is not None:
+                how.progress(sum(map(len, rows.values())), len(seeds) * len(rows))
     card = DisentanglementCard(tuple(sizes), rows, correlations, tuple(sizes.values()), len(images))
     tables, places = card.tables(), list(_SUMMARY.values())
     notes = [f"swap test: {tables[0].verdict(places.index(_SWAP))}"]
@@ -280,7 +280,7 @@ def disentangle(
         "pictures": len(images), "features": sizes, "seeds": list(seeds), "left_out": unused,
         "rows": card.numbers(),
     }  # fmt: skip
-    return Scores(tables, values, notes, result=card)
+    return Scores(tables, values, [*notes, kept.summary()], result=card)
 
 
 def swap_intervals(tests: Sequence[SwapScores]) -> tuple[Interval, Interval]:
