@@ -21,7 +21,7 @@ import derender
 from derender.data import ImageSet
 from derender.data.synthetic import SyntheticSet, faces
 from derender.evaluation import disentangle
-from derender.evaluation.depth import geometry_scores
+from derender.evaluation.truth import geometry_scores
 from derender.postprocess import embedding, fitting
 
 MODEL, PLAIN_STEPS = "rendered-faces-64", 60

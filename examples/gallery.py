@@ -26,7 +26,7 @@ from derender.data import as_float, read_ground_truth
 from derender.data.synthetic import PARTS, cars, faces, write_generated
 from derender.data.synthetic.settings import CLASSES, LIGHTS, VIEWS, CarSettings, FaceSettings, named_settings
 from derender.data.synthetic.synthetic_set import SyntheticSet
-from derender.evaluation.depth import predicted_depth
+from derender.evaluation.truth import predicted_depth
 from derender.photo import open_photograph
 from derender.report import colours
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid

@@ -26,11 +26,11 @@ def dinov2(tmp_path_factory, seeded):
 
 def test_features_of_dinov2_are_the_class_token_and_the_mean_patch(dinov2):
     folder, net = dinov2
-    model = Dinov2.open(str(folder), image_size=32, enlarged=28)
+    model = Dinov2.open(str(folder), image_size=32)
     model.choose(("class", "patches"))
     images = torch.rand(3, 3, 32, 32)
     features = model.embed(images)
-    large = interpolate(images, (28, 28), mode="bicubic", antialias=True).clamp(0, 1)
+    large = interpolate(images, (224, 224), mode="bicubic", antialias=True).clamp(0, 1)
     mean, std = (torch.tensor(values).view(3, 1, 1) for values in (IMAGENET_MEAN, IMAGENET_STD))
     with torch.no_grad():
         tokens = net(pixel_values=(large - mean) / std).last_hidden_state

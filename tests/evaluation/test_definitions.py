@@ -13,7 +13,7 @@ TABLES = (
     *("evaluation/clustering", "evaluation/clustering_scores", "evaluation/linear_probing"),
     *("evaluation/paper_tables", "evaluation/score_table", "evaluation/disentanglement/card"),
     *("evaluation/segmentation", "evaluation/robust"),
-    *("evaluation/depth", "evaluation/factors", "evaluation/pixels"),
+    *("evaluation/truth", "evaluation/pixels"),
 )
 
 

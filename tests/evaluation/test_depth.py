@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from derender.data import GroundTruth, read_ground_truth
-from derender.evaluation.depth import evaluate_geometry, geometry_scores
+from derender.evaluation.truth import evaluate_geometry, geometry_scores
 from derender.scene.camera import pixel_rays
 
 FOV_DEG = 10.0

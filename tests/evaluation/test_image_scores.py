@@ -6,8 +6,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from derender.evaluation.image_scores import ImageResult, image_rows, image_verdicts
-from derender.evaluation.score_table import Column
+from derender.evaluation.image_scores import ImageResult, image_rows
+from derender.evaluation.score_table import Column, verdict
 
 ERROR = np.random.default_rng(0).normal(1.0, 0.2, 400)
 ONE = {"error": Column("error", "low"), "good": Column("good", "high")}
@@ -58,6 +58,8 @@ def test_tables_are_in_the_units_of_their_columns():
     assert texts == ["2.000", "1.000-3.000", "20.0", "10.0-30.0", "0.900"] and table.caption == "3 images"
     assert table.rows[1].control and table.rows[1].note == "flat"
     assert Both().table().rows[1].cells == pytest.approx([4.0, 10.0, 1])
-    side, mad_words = image_verdicts(rows[0], Both.columns)
-    assert side.startswith("SIDE x 100: 2.000, better than the strongest control (plane), by +2.000, 95")
-    assert mad_words.startswith("MAD: 20.0, worse than the strongest control (plane), by -10.0")
+    side, mad_words = (verdict(rows[0], score, column) for score, column in Both.columns.items())
+    assert side.startswith(
+        "model: SIDE x 100 2.000, better than the strongest control (plane), by +2.000, 95"
+    )
+    assert mad_words.startswith("model: MAD 20.0, worse than the strongest control (plane), by -10.0")

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
 from derender.data import ImageSet
-from derender.features import FeatureTable, Progress, embed_image_set, table_labels
+from derender.features import FeatureTable, Progress, table_labels
 from derender.inputs import as_images, part_of
 from derender.model import load
 from derender.storage.places import optional
@@ -154,15 +154,6 @@ def untrained_twin(model: Any, seed: int) -> Any:
     """The same settings, factors and renderer with fresh weights; torch's global generator is left alone."""
     twin = type(model).seeded(model.settings, seed, factors=model.factors, renderer=model.renderer)
     return twin.to(model.device).eval()
-
-
-def untrained_features(
-    model: Any, images: ImageSet, *, seed: int = 0, batch_size: int = 256, progress: Progress | None = None
-) -> FeatureTable:
-    """Features of the same architecture with fresh weights: the model's own factors."""
-    origin = {"control": "untrained", "seed": seed}
-    twin = untrained_twin(model, seed)
-    return embed_image_set(twin, images, batch_size=batch_size, progress=progress, origin=origin)
 
 
 class Untrained:

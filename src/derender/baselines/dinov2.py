@@ -49,15 +49,14 @@ class Dinov2(base.BaselineModel):
 
     @classmethod
     def open(
-        cls, source: str | Path | None = None, *, image_size: int | None = None, seed: int = 0,
-        enlarged: int = 224,
-    ) -> "Dinov2":  # fmt: skip
+        cls, source: str | Path | None = None, *, image_size: int | None = None, seed: int = 0
+    ) -> "Dinov2":
         """The network with its published weights, ready to embed; ``seed`` is ignored.
 
         ``source`` is an id in the Hugging Face cache, or a folder with config.json and model.safetensors.
         Missing weights, a pickle, or another kind of network are a ValueError.
         """
-        settings = Dinov2Settings(image_size=image_size or 64, enlarged=enlarged)
+        settings = Dinov2Settings(image_size=image_size or 64)
         if source is not None:
             settings = settings.model_copy(update={"weights": str(source)})
         source, folder = settings.weights, Path(settings.weights)

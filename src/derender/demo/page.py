@@ -15,9 +15,9 @@ from jaxtyping import UInt8
 from derender import __version__
 from derender.data import as_float
 from derender.demo.story import BUNDLED, STAGES, DemoResult
-from derender.evaluation.depth import predicted_depth
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import ScoreTable
+from derender.evaluation.truth import predicted_depth
 from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 from derender.report import colours

@@ -11,15 +11,7 @@ from derender.evaluation.bootstrap import difference, estimate, resamples
 from derender.evaluation.clustering import cluster, compare_clusterings, finch_levels
 from derender.evaluation.clustering_methods import clusterings, cut, finch, finch_clusters, ward_tree
 from derender.evaluation.clustering_scores import chance_scores, cluster_scores
-from derender.evaluation.depth import GeometryResult, evaluate_geometry, geometry_scores
 from derender.evaluation.disentanglement import disentangle
-from derender.evaluation.factors import (
-    FactorResult,
-    albedo_error,
-    camera_error,
-    evaluate_factors,
-    light_error,
-)
 from derender.evaluation.feature_rows import at_least
 from derender.evaluation.identity import Pairs, area_under_roc, identify, read_pairs, verify
 from derender.evaluation.linear_probes import majority_answers, probe
@@ -37,6 +29,16 @@ from derender.evaluation.robust import robustness
 from derender.evaluation.scenes import geometry, reconstruction
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable
 from derender.evaluation.segmentation import segment
+from derender.evaluation.truth import (
+    FactorResult,
+    GeometryResult,
+    albedo_error,
+    camera_error,
+    evaluate_factors,
+    evaluate_geometry,
+    geometry_scores,
+    light_error,
+)
 
 __all__ = [
     "Column", "FactorResult", "GeometryResult", "Pairs", "ReconstructionResult", "Row", "Rows",

@@ -20,12 +20,11 @@ from derender.data import ImageSet
 from derender.data.layouts import rendered
 from derender.data.layouts.layout import base_name
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
-from derender.evaluation.depth import angle_deg
-from derender.evaluation.factors import light_in_camera
 from derender.evaluation.image_scores import binned_rows
 from derender.evaluation.options import Options
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table
+from derender.evaluation.truth import angle_deg, light_in_camera
 from derender.features import map_batches
 from derender.features.table import named
 from derender.inputs import as_model

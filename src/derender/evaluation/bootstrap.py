@@ -47,13 +47,6 @@ class Difference:
     high: float
     above: bool
 
-    def text(self, score: str) -> str:
-        """One sentence."""
-        return (
-            f"{score.replace('_', ' ')}: {self.value:+.3f} ({self.low:+.3f} to {self.high:+.3f}) against "
-            f"{self.rival}, {'above it' if self.above else 'not above it'}"
-        )
-
 
 @dataclass(frozen=True)
 class ScoredRow:

@@ -80,7 +80,12 @@ def cluster(
             levels[row.name] = finch_levels(ready.features[row.name][0], ready.labels[names[0]], how.memory)
             tables.append(finch_table(row.name, levels[row.name], result.labels[names[0]]))
     approximate = approximation(method, result.n_rows)
-    notes = [*how.notes, *left_out, verdict(result.rows[0], "accuracy"), *filter(None, [approximate])]
+    notes = [
+        *how.notes,
+        *left_out,
+        verdict(result.rows[0], "accuracy", CLUSTER_COLUMNS["accuracy"]),
+        *filter(None, [approximate]),
+    ]
     if ready.n_dropped:
         why = f"without a label of {', '.join((*names, *mean_by))}"
         if min_count > 1 or max_count:

@@ -101,20 +101,6 @@ def row_of(name: str, runs: FeatureSource | Sequence[FeatureSource], options: Op
     return FeatureRow(name, tuple(tables), chosen, "control" in tables[0].origin)
 
 
-def one_row(features: FeatureSource, options: Options) -> FeatureRow:
-    """The row of one table or model, named after its factors.
-
-    The default factors are all where a table has none of them; others that it lacks are a ValueError.
-    """
-    chosen = options.chosen
-    row = row_of("all" if chosen is None else " + ".join(chosen), features, options)
-    if chosen is None or row.factors is not None:
-        return row
-    if chosen != DEFAULT_FACTORS:
-        row.tables[0].concatenate(chosen)  # raises: names the unknown factor
-    return replace(row, name=" + ".join(row.tables[0].factors))
-
-
 def opened(source: ModelSource, device: str) -> Any:
     """A model ready for use: ours, or the baseline in a run folder."""
     if not isinstance(source, Derenderer):
@@ -285,8 +271,17 @@ def _made_by(table: FeatureTable) -> list[Any]:
 
 
 def subject_and_controls(features: FeatureSource, options: Options) -> list[FeatureRow]:
-    """The row of one table or model, and behind it the controls of its images."""
-    return with_controls([one_row(features, options)], options)
+    """The row of one table or model, named after its factors, and behind it the controls of its images.
+
+    The default factors are all where a table has none of them; others that it lacks are a ValueError.
+    """
+    chosen = options.chosen
+    row = row_of("all" if chosen is None else " + ".join(chosen), features, options)
+    if chosen is not None and row.factors is None:
+        if chosen != DEFAULT_FACTORS:
+            row.tables[0].concatenate(chosen)  # raises: names the unknown factor
+        row = replace(row, name=" + ".join(row.tables[0].factors))
+    return with_controls([row], options)
 
 
 def with_controls(rows: Sequence[FeatureRow], options: Options) -> list[FeatureRow]:

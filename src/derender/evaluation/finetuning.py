@@ -33,7 +33,7 @@ from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import Scores, scored_table
+from derender.evaluation.score_table import Scores, scored_table, verdict
 from derender.features import map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
@@ -313,8 +313,8 @@ def score_finetuned(
     beside |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
     others = [ScoredRow(name, True, 1, row.scores) for name, row in beside.items()]
     scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *others)
-    versus = with_verdicts(scored)[0].versus
-    notes = [versus[score].text(score) for score in BOTH]
+    judged = with_verdicts(scored)
+    notes = [verdict(judged[0], score, LINEAR_COLUMNS[score]) for score in BOTH]
     unlabelled, names = int((~target.asked.known).sum()), asked.names
     task_name = f"{len(names)} classes" if asked.kind == "classes" else f"mean of {len(names)} yes/no labels"
     caption = (
@@ -325,7 +325,7 @@ def score_finetuned(
     every: dict[str, Any] = {"intervals": BOTH, "deviations": ()}
     table = scored_table(caption, "trained on labels", scored, LINEAR_COLUMNS, **every)
     values = {
-        "rows": numbers_of(scored), "versus": {score: asdict(versus[score]) for score in BOTH},
+        "rows": numbers_of(scored), "versus": {score: asdict(judged[0].versus[score]) for score in BOTH},
         "kind": asked.kind, "names": names, "n_train": count, "n_test": len(test), "n_unlabelled": unlabelled,
     }  # fmt: skip
     return Scores([table], values, notes, result=scored)

@@ -100,7 +100,9 @@ def identify(
         "probes": probes, "centred": centred,
         "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
-    return Scores(tables, values, [*how.notes, verdict(scored[0], "all"), how.memory.summary()], scored)
+    return Scores(
+        tables, values, [*how.notes, verdict(scored[0], "all", columns["all"]), how.memory.summary()], scored
+    )
 
 
 def _angles(table: FeatureTable, by: str | None) -> np.ndarray | None:
@@ -259,7 +261,7 @@ def verify(
         "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
         "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
-    notes = [*how.notes, verdict(scored[0], "accuracy"), how.memory.summary()]
+    notes = [*how.notes, verdict(scored[0], "accuracy", columns["accuracy"]), how.memory.summary()]
     return Scores(tables, values, notes, scored)
 
 

@@ -8,7 +8,6 @@ covered) is left out of its row's means; a single image has no interval.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from math import isfinite
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -121,22 +120,6 @@ def binned_rows(
         for row, own in scores.items()
     }
     return image_rows(each, columns, **how), columns, counts
-
-
-def image_verdicts(row: bootstrap.ScoredRow, columns: Mapping[str, Column]) -> list[str]:
-    """In words, for every score: the row against the strongest control."""
-    results = []
-    for score, column in columns.items():
-        one = row.versus.get(score)
-        if one is None or not isfinite(one.low):
-            continue
-        how = "better than" if one.above else "worse than" if one.high < 0 else "not distinguished from"
-        ends = [f"{column.scale * value:+.{column.digits}f}" for value in (one.value, one.low, one.high)]
-        results.append(
-            f"{column.name}: {column.text(column.scale * row.scores[score].value)}, {how} the strongest "
-            f"control ({one.rival}), by {ends[0]}, 95 % {ends[1]} to {ends[2]}"
-        )
-    return results
 
 
 def _estimate(values: np.ndarray, weights: np.ndarray) -> bootstrap.Estimate:

@@ -90,8 +90,6 @@ def compare(
         return Scores(tables, {**numbers, "parts": values}, [how.memory.summary()])
     if masks is not None:
         raise ValueError(f"masks go with the table of segmentation, not with {table}")
-    if models and images is None:
-        raise ValueError(f"model {next(iter(models))!r} needs images to embed: give images")
     if finetune and (spec.kind != "linear" or not models):
         raise ValueError("finetune trains the encoders of models: give the linear table, models and images")
     if supervised and not finetune:

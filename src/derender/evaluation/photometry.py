@@ -27,11 +27,11 @@ from derender.data import ImageSet, read_ground_truth
 from derender.data.image_set import as_float
 from derender.evaluation.angles import agreement, agreement_table
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
-from derender.evaluation.image_scores import binned_rows, image_rows, image_verdicts
+from derender.evaluation.image_scores import binned_rows, image_rows
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import reconstruction_scores
 from derender.evaluation.scenes import optimised
-from derender.evaluation.score_table import Column, Scores, scored_table
+from derender.evaluation.score_table import Column, Scores, scored_table, verdict
 from derender.features import map_batches, missing
 from derender.features.extract import check_size
 from derender.inputs import Progress, as_images, as_model
@@ -261,5 +261,5 @@ def relight(
         caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {len(people)} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
         values[title.lower()] = numbers_of(scored)
-        notes += [f"{title}, {note}" for note in image_verdicts(scored[0], {"all": columns["all"]})]
+        notes.append(f"{title}, {verdict(scored[0], 'all', columns['all'])}")
     return Scores(tables, values, notes)

@@ -2,7 +2,7 @@
 
 Controls are the mean image; the images from 64 principal components of their pixels, which know no
 geometry; and an untrained model. The first two are scored inside the model's own masks. A low error alone
-proves nothing about geometry (a copied image has none): read it with evaluation/depth.py.
+proves nothing about geometry (a copied image has none): read it with evaluation/truth.py.
 
 SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of 11 x 11 pixels with sigma
 1.5, mean over colours. The centre of a window that reaches over the edge of the mask is left out. So are five
@@ -133,9 +133,9 @@ def evaluate_reconstruction(
     )
 
 
-def component_count(images: int, most: int = COMPONENTS) -> int:
-    """Number of principal components from so many images: at most a quarter of their number."""
-    return max(1, min(most, images // 4))
+def component_count(images: int) -> int:
+    """Number of principal components from so many images: 64, at most a quarter of their number."""
+    return max(1, min(COMPONENTS, images // 4))
 
 
 def evenly(count: int, most: int = COMPONENT_IMAGES) -> np.ndarray:

@@ -144,7 +144,7 @@ def robustness(
         progress=how.stage("probing", "probes"),
     )  # fmt: skip
     notes = [*how.notes, f"{len(trial.images):,} images: {trial.how}"]
-    notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA)}" for curve in result.curves]
+    notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA, _AREA)}" for curve in result.curves]
     address = images.source if isinstance(images, ImageSet) else images
     values = {"pictures": way, "data": None if address is None else str(address), **result.numbers()}
     return Scores(result.tables(score), values, [*notes, how.memory.summary()], result=result)

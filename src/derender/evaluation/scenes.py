@@ -17,12 +17,11 @@ import numpy as np
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_ground_truth
 from derender.evaluation.bootstrap import numbers_of
-from derender.evaluation.depth import GeometryResult, evaluate_geometry
-from derender.evaluation.factors import FactorResult, evaluate_factors
-from derender.evaluation.image_scores import ImageResult, image_verdicts
+from derender.evaluation.image_scores import ImageResult
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, evenly, mean_image
-from derender.evaluation.score_table import Scores
+from derender.evaluation.score_table import Scores, verdict
+from derender.evaluation.truth import FactorResult, GeometryResult, evaluate_factors, evaluate_geometry
 from derender.features import Progress, embed_images, model_fingerprint
 from derender.inputs import as_images, as_model
 from derender.model import Derenderer
@@ -118,7 +117,8 @@ def _scored(model: Derenderer, protocols: Protocols, inputs: Mapping[str, Any], 
     inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
     result = {name: how.memory.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
     rows = {name: one.rows(how.resamples) for name, one in result.items()}
-    notes = [note for name, one in result.items() for note in image_verdicts(rows[name][0], one.columns)]
+    asked = [(rows[name][0], one.columns) for name, one in result.items()]
+    notes = [verdict(row, *column) for row, columns in asked for column in columns.items()]
     intervals = {name: numbers_of(scored) for name, scored in rows.items()}
     values = {"pictures": len(inputs["images"]), **result, "intervals": intervals}
     tables = [one.table(rows[name]) for name, one in result.items()]

@@ -283,16 +283,15 @@ def judged_tables(
     return [scored_table(caption, first, rows, columns, **how), verdict_table(rows, columns, asked)]
 
 
-def verdict(row: ScoredRow, score: str) -> str:
-    """In words: whether a row is above the strongest control in one score."""
-    own, one = row.scores[score], row.versus.get(score)
-    if one is None:
-        return f"{row.name}: {own.value:.3f} ({score})"
-    result = "above" if one.above else "below" if one.high < 0 else "not distinguished from"
-    return (
-        f"{row.name}: {score} {own.value:.3f}, {result} the strongest control ({one.rival}): "
-        f"{one.value:+.3f}, 95 % {one.low:+.3f} to {one.high:+.3f}"
-    )
+def verdict(row: ScoredRow, score: str, column: Column) -> str:
+    """In words, in the unit of the score's column: whether a row is better than the strongest control."""
+    own, one = row.scores[score].value, row.versus.get(score)
+    shown = f"{row.name}: {column.name} {column.text(column.scale * own)}"
+    if one is None or not isfinite(one.low):
+        return shown
+    how = "better than" if one.above else "worse than" if one.high < 0 else "not distinguished from"
+    ends = [f"{column.scale * value:+.{column.digits}f}" for value in (one.value, one.low, one.high)]
+    return f"{shown}, {how} the strongest control ({one.rival}), by {ends[0]}, 95 % {ends[1]} to {ends[2]}"
 
 
 def _number(cell: Cell) -> float | None:

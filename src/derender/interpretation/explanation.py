@@ -5,7 +5,7 @@ learns from. Controls: the same features with shuffled labels in the training ro
 ``drop`` is a second opinion without gradients: the AUC lost when one factor's features are exchanged.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from sklearn.metrics import roc_auc_score
 
-from derender.baselines.controls import untrained_features
+from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, suggestion
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.feature_rows import chosen_labels
 from derender.evaluation.image_scores import image_rows
 from derender.evaluation.linear_task import Rows, Task, choose_rows
 from derender.evaluation.score_table import Scores
-from derender.features import FeatureTable, embed_image_set
+from derender.features import FeatureTable, embed_image_set, embed_images
 from derender.inputs import as_images, as_model
 from derender.interpretation import tables
 from derender.interpretation.attribution import Similarity, captum_attr, factor_shares, integrated_gradients
@@ -28,6 +28,7 @@ from derender.interpretation.probe import Probe, fit_probe, question
 from derender.interpretation.tables import (
     ClusterShares,
     Explanation,
+    Features,
     PairParts,
     ShareRow,
     cluster_shares,
@@ -35,7 +36,6 @@ from derender.interpretation.tables import (
 )
 from derender.storage.places import require_known
 
-Features = Mapping[str, np.ndarray]
 BASELINES = ("zero", "mean")
 BOOTSTRAP = 500
 LEARNED_SHARE, LEARNED_MOST = 0.4, 500
@@ -138,7 +138,7 @@ def explain(
     untrained = []
     for one in own:
         how = {"batch_size": batch_size, "progress": progress(f"untrained encoder {one}")}
-        untrained.append(untrained_features(net, images, seed=one, **how).factors)
+        untrained.append(embed_images(untrained_twin(net, one), images.images, **how))
     shares = explain_labels(
         table.factors, task, split, untrained=untrained, seeds=own, head=head, output=output,
         baseline=baseline, progress=progress("probing"),

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import UInt8
 
 from derender.baselines import read_any_config
-from derender.baselines.controls import untrained_features
+from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, Progress, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_image
@@ -211,7 +211,7 @@ def _explained(subject: Subject) -> Values:
     task = question(sample.labels, names, source=sample.source)
     split = choose_rows(task, sample.files, (max(2, int(0.4 * task.known.sum())),), (0,))
     table = embed_image_set(subject.model, sample)
-    fresh = untrained_features(subject.model, sample, seed=0).factors
+    fresh = embed_image_set(untrained_twin(subject.model, 0), sample).factors
     result = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
     shares = share_values(result, share_chart(result)[0])
     return {"count": f"{len(sample):,}", "names": ", ".join(names), "shares": shares}
