@@ -17,11 +17,11 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (7_415, 32),
-    "evaluation": (7_425, 36),  # public functions name their errors
+    "evaluation": (7_305, 32),
     "report": (4_120, 25),  # images that do not suit a model are left out
-    "cli": (2_340, 32),  # the same
+    "cli": (2_325, 32),  # the same
     "training": (3_490, 17),  # CUDA graphs; the model that fits better
-    "baselines": (2_485, 11),
+    "baselines": (2_465, 11),
     "render": (1_690, 15),
     "features": (1_390, 8),  # a folder is refused before images are embedded
     "interpretation": (1_085, 5),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_855, 246)  # on the way to (37_000, 270)
+TOTAL = (39_700, 242)  # on the way to (37_000, 270)
 TEST_LINES = 26_050
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -67,7 +67,7 @@ def test_geometry_beside_controls_with_intervals(model, rendered, tmp_path, numb
     again, shown = numbers(*words, "--markdown", tmp_path / "geometry.md")
     assert again == told and "0 results computed, 3 found" in shown
     assert "| prediction | SIDE x 100 ↓ | 95 % | MAD ↓ | 95 % |" in (tmp_path / "geometry.md").read_text()
-    assert told["pictures"] == 6 and "factors_untrained" in told
+    assert told["pictures"] == 6 and told["factors"]["untrained"]["albedo"] > 0
     assert told["geometry"]["plane"]["side"] > told["geometry"]["average_depth"]["side"]
     assert told["reconstruction"]["model"]["ssim"] is not None
     side = told["intervals"]["geometry"]["model"]["scores"]["side"]
@@ -76,8 +76,8 @@ def test_geometry_beside_controls_with_intervals(model, rendered, tmp_path, numb
     rows = told["intervals"]["reconstruction"]
     assert list(rows) == ["model", "mean image", "PCA (1)", "untrained model"]
     assert rows["model"]["versus"]["l1"]["rival"] in rows
-    assert 0 < told["factors"]["albedo"] <= told["factors"]["albedo_global"]
-    assert told["factors"]["light_aligned"]["mean_deg"] <= told["factors"]["light"]["mean_deg"] + 1
+    ours = told["factors"]["model"]
+    assert 0 < ours["albedo"] <= ours["albedo_global"] and ours["aligned"] <= ours["light"] + 1
 
 
 @pytest.mark.parametrize("protocol", ["geometry", "brightness"])

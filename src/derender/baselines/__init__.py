@@ -96,35 +96,30 @@ def open_baseline(
 def embed_baseline(
     name: str, images: Any, out: str | Path, source: str | None = None, *,
     features: Sequence[str] | None = None, image_size: int | None = None, components: int = 64, seed: int = 0,
-    device: str = "auto", progress: Callable[[int, int], object] | None = None,
-    reading: Mapping[str, Any] | None = None, **how: Any,
+    device: str = "auto", progress: Callable[[int, int], object] | None = None, **how: Any,
 ) -> "Embedded":  # fmt: skip
     """Write the feature table of a baseline or a control to the parquet file ``out``.
 
-    Arguments are ``open_baseline``'s, and for networks those of `derender.embed_to_file`. ``components`` is
-    the number of dimensions of pca and noise. ``reading`` is how an address of images is read: ``dataset``,
-    ``part``, ``limit``, ``keep_duplicates``.
+    Arguments are ``open_baseline``'s and those of `derender.embed_to_file`, of which a control takes how
+    images are read. ``components`` is the number of dimensions of pca and noise.
     """
     from derender.baselines.controls import control_features
     from derender.features.embedding import LISTED_SKIPPED, Embedded, embed_to_file
     from derender.inputs import as_images
 
-    reading = dict(reading or {})
     if name not in CONTROLS:
         net = open_baseline(name, source, device=device, features=features, image_size=image_size, seed=seed)
         origin = {"source": source, "baseline": name}
-        return embed_to_file(images, net, out, **reading, origin=origin, progress=progress, **how)
+        return embed_to_file(images, net, out, origin=origin, progress=progress, **how)
     if how.get("engine") == "ray":
         raise ValueError(f"engine 'ray' is for networks, and {name} has none: leave it out")
-    part = reading.pop("part", "all")
-    images = as_images(images, image_size or 64, **reading)
-    table = control_features(
-        name, images, part=part, model=source, components=components, seed=seed, progress=progress
-    )
+    part, kept = how.get("part", "all"), how.get("keep_duplicates", False)
+    reading = {"dataset": how.get("dataset", "auto"), "limit": how.get("limit")}
+    images = as_images(images, image_size or 64, **reading, keep_duplicates=kept)
+    table = control_features(name, images, part, source, components=components, seed=seed, progress=progress)
     widths, origin = {name: table.factors[name].shape[1]}, {**table.origin}
     origin |= {} if part == "all" else {"part": part}
     replace(table, origin=origin).write(out)
     facts = origin["data"], origin["layout"]
     counts = len(images.skipped), images.skipped[:LISTED_SKIPPED], len(images.duplicates), 0
-    kept = reading.get("keep_duplicates", False)
     return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, *counts, *facts, kept)

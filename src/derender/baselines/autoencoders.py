@@ -4,10 +4,10 @@ Plain: encoder and map decoder of our albedo net, 12,982,848 parameters, least s
 al., ICLR 2017): the same with a normal posterior over the code. Its Bernoulli likelihood is divided by the
 number of colour values, so that both terms have one scale. VQ-VAE: source van den Oord et al., *Neural
 Discrete Representation Learning* (2017), in the size that the paper compares with, by its two readings:
-19,199,491 parameters are those of 512 channels, 416 have 12,724,195 (``width``). Both counts hold for eight
-BatchNorms, whose places they do not tell. The codebook, of vector-quantize-pytorch (MIT), is learnt by
-gradient as in the source, from k-means on the first batch. Entries that hardly any place chose of late are
-replaced by places of the batch.
+19,199,491 parameters are those of 512 channels, 416 have 12,724,195 (``width``), both with eight BatchNorms,
+whose places it does not tell. The codebook, of vector-quantize-pytorch (MIT), is learnt by gradient as in the
+source, from k-means on the first batch. Entries that hardly any place chose are replaced by places of the
+batch.
 """
 
 from collections.abc import Iterator

@@ -1,11 +1,10 @@
 """Controls without training: pixels, PCA, Gradientfaces, HOG, LBP, noise, and an untrained encoder.
 
-A learned feature has to beat these. On 1,000 labels of CelebA, PCA reaches a balanced accuracy of 0.674 and
-an untrained encoder 0.662. Histograms of oriented gradients: Dalal and Triggs (CVPR 2005), as scikit-image
-(BSD) computes them: nine orientations, cells of 8x8 pixels, blocks of 2x2 cells, L2-Hys; 1,764 numbers at
-64x64 pixels. Local binary patterns: Ahonen et al. (ECCV 2004), eight neighbours at two pixels, 59 uniform
-patterns, square roots of their shares in cells of 8x8 pixels. Gradientfaces: Zhang et al. (TIP 2009), the
-direction of the gradient, which keeps faces apart in any light.
+Histograms of oriented gradients: Dalal and Triggs (CVPR 2005), as scikit-image (BSD) computes them: nine
+orientations, cells of 8x8 pixels, blocks of 2x2 cells, L2-Hys; 1,764 numbers at 64x64 pixels. Local binary
+patterns: Ahonen et al. (ECCV 2004), eight neighbours at two pixels, 59 uniform patterns, square roots of
+their shares in cells of 8x8 pixels. Gradientfaces: Zhang et al. (TIP 2009), the direction of the gradient,
+which keeps faces apart in any light.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +17,7 @@ from sklearn.decomposition import PCA
 
 from derender.data import ImageSet
 from derender.features import FeatureTable, Progress, table_labels
-from derender.inputs import as_images, part_of
+from derender.inputs import part_of
 from derender.model import load
 from derender.storage.places import optional
 
@@ -30,18 +29,16 @@ UNIFORM_PATTERNS = 59
 
 
 def control_features(
-    name: str, images: ImageSet | str | Path, *, image_size: int = 64, dataset: str = "auto",
-    limit: int | None = None, part: str = "all", model: str | Path | None = None, components: int = 64,
+    name: str, images: ImageSet, part: str = "all", model: str | Path | None = None, *, components: int = 64,
     seed: int = 0, progress: Progress | None = None,
 ) -> FeatureTable:  # fmt: skip
     """The table of a control by its name, one of ``CONTROLS``, which is also that of its only factor.
 
-    ``images``, an image set or the address of one, are read as by `derender.inputs.as_images`. The principal
-    components of a part are those of the training part. ``components`` is the number of dimensions of pca and
-    noise, ``seed`` that of pca's solver and of noise. ``progress`` is called with (images done, all).
+    ``part`` is one of the split of ``model``; its principal components are those of the training part.
+    ``components`` is the number of dimensions of pca and noise, ``seed`` that of pca's solver and of noise.
+    ``progress`` is called with (images done, all).
     """
-    whole = as_images(images, image_size, dataset=dataset, limit=limit)
-    chosen = part_of(whole, part, model)
+    chosen = part_of(images, part, model)
     if name == "pixels":
         return pixel_features(chosen)
     if name in DESCRIPTORS:
@@ -49,7 +46,7 @@ def control_features(
     if name == "noise":
         noise = np.random.default_rng(seed).standard_normal((len(chosen), components))
         return control_table(chosen, name, noise, {"seed": seed})  # the chance level of any protocol
-    fit_on = chosen if part == "all" else part_of(whole, "train", model)
+    fit_on = chosen if part == "all" else part_of(images, "train", model)
     return pca_features(chosen, components=components, fit_on=fit_on, seed=seed)
 
 

@@ -7,8 +7,8 @@ gives one code for all layers, the others what each adds to it; the generator's 
 
 Losses: squared error and perceptual distance (features learnt without labels from the same images) between
 image and inversion. Codes are released one after the other, and their difference from the first is kept
-small: W+ stays near W. Instead of e4e's discriminator of codes the first code is drawn towards the mean code.
-Leaves out the identity loss, which needs a face recogniser.
+small. Instead of e4e's discriminator of codes the first code is drawn towards the mean code. Leaves out the
+identity loss, which needs a face recogniser.
 """
 
 from itertools import pairwise

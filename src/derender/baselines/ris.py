@@ -6,11 +6,10 @@ the published FFHQ networks. Images are compared by cosine and inverted by e4e.
 
 The catalogue: clusters are found among the activations of random images of the generator, by spherical
 k-means of squared activations of a 32x32 layer. Images with part masks, inverted, show which part each
-cluster is (in the source people name the 18 clusters). The clusters then mark the parts in the random images.
-A channel's score for a part is its squared, instance-normalised activation there, averaged. A softmax over
+cluster is (in the source people name them). The clusters then mark the parts in the random images. A
+channel's score for a part is its squared, instance-normalised activation there, averaged. A softmax over
 parts at temperature 0.1, cut below 0.8, assigns a channel to a part, if to any. Channels that make colours
-belong to none. Those of the four coarsest layers (2,048 in the published network) belong to hair alone, the
-rest of them to the pose.
+belong to none. Those of the four coarsest layers belong to hair alone, the rest of them to the pose.
 """
 
 from collections.abc import Callable, Sequence

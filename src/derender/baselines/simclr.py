@@ -3,11 +3,10 @@
 Source: Chen et al., *A Simple Framework for Contrastive Learning of Visual Representations* (ICML 2020): a
 projection head of two layers that is left out of the feature, NT-Xent at temperature 0.5. The encoder is that
 of our geometry net, so only its training signal differs. Ordinary views: crop, flip, colour jitter, grey and
-blur, each random for every image, with half the source's strengths for colours. Crops keep more of the image
-by default. Physical views: a trained derender model decomposes each image, and both views show the scene
-under other lighting and from another viewpoint, sampled as in LOOCC. Views then differ in exactly those
-factors that the feature should not depend on. Leaves out LARS, batches of thousands, and hue in HSV: colours
-rotate about the grey axis of RGB.
+blur, each random for every image, with half the source's strengths for colours and larger crops. Physical
+views: a trained derender model decomposes each image, and both views show the scene under other lighting and
+from another viewpoint, as in LOOCC. Leaves out LARS, batches of thousands, and hue in HSV: colours rotate
+about the grey axis of RGB.
 """
 
 import math

@@ -61,8 +61,7 @@ def embed(
         else:
             how["features"] = baselines.features and [part.strip() for part in baselines.features.split(",")]
             how |= {option: getattr(baselines, option) for option in ("image_size", "components", "seed")}
-            call = derender.baselines.embed_baseline
-            done = call(name, images.address, out, model, reading=reading, **how)
+            done = derender.baselines.embed_baseline(name, images.address, out, model, **reading, **how)
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
     notice("\n".join([done.describe(), *named]))
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())

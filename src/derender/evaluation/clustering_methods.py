@@ -4,21 +4,19 @@
 (scikit-learn, Euclidean, ten starts) is fitted anew for each number. Ward is Euclidean as in the paper, FINCH
 cosine as in its paper. Above ``EXACT_ROWS`` rows all are approximate, and ``approximation`` says how.
 
-FINCH: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it), with cosine distance. Every
-row is linked to its nearest other row; the connected parts are the clusters; their means are the rows of the
-next level. A level that takes away at most one cluster, or leaves only one, ends the hierarchy, as in
-`finch-clust`. That package holds several N x N arrays. Leaves out its cut of long links, which has
-no effect in it.
+FINCH: Sarfraz, Sharma and Stiefelhagen, CVPR 2019 (the paper's appendix uses it). Every row is linked to its
+nearest other row; the connected parts are the clusters; their means are the rows of the next level. A level
+that takes away at most one cluster, or leaves only one, ends the hierarchy. So it does in `finch-clust`,
+which holds several N x N arrays. Leaves out its cut of long links, which has no effect in it.
 
 Ward's criterion (1963) is reducible (Bruynooghe 1977): a merged pair is never nearer to a third cluster than
-the nearer of its parts was. So all pairs that are each other's nearest neighbour may be merged at once, and
-only those rows look again whose neighbour was merged. Clusters are kept as mean and size, distances are made
-block by block with one matrix product and forgotten. SciPy's ``linkage`` finds the same tree from the
-N(N-1)/2 distances held in memory: 10 GB for 50,000 rows.
+the nearer of its parts was. So all pairs that are each other's nearest neighbour are merged at once, and only
+those rows look again whose neighbour was merged. Distances are made block by block and forgotten: SciPy's
+``linkage`` holds N(N-1)/2 of them, 10 GB for 50,000 rows.
 
 ``ward_in_cells`` builds Ward's exact tree inside every cell of near rows (neighbours.py). Of all merges the
-cheapest are made until ``LEAVES`` clusters are left, and Ward's exact tree is built over their means and
-sizes. No merge before the leaves goes over a cell's border.
+cheapest are made until ``LEAVES`` clusters are left, and Ward's exact tree is built over these. No merge
+before the leaves goes over a cell's border.
 """
 
 from collections.abc import Iterable

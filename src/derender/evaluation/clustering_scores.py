@@ -1,10 +1,9 @@
 """Scores of a clustering against classes, and their chance level.
 
-A score is one function below ``@metric``; its name goes to JSON and its column to tables. All come from
-the table of counts (class by cluster), many tables at a time. Accuracy and F1 are the paper's (Sec. 4.2);
-NMI, ARI and Hungarian accuracy are those of scikit-learn and SciPy. Purity and NMI of random clusters are
-far from 0, and the purity of one single cluster is the majority's share: read no score without its chance
-level.
+A score is one function below ``@metric``; its name goes to JSON and its column to tables. All come from the
+table of counts (class by cluster), many tables at a time. Accuracy and F1 are the paper's (Sec. 4.2); NMI,
+ARI and Hungarian accuracy are those of scikit-learn and SciPy. Purity and NMI of random clusters are far from
+0: read no score without its chance level.
 """
 
 from collections.abc import Callable, Iterable

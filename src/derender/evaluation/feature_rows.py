@@ -3,10 +3,9 @@
 A row is one kind of feature; several tables in one row are runs of the same thing (seeds). ``row_of`` makes
 one of tables and models, ``prepare`` the arrays that protocols take. Leaves out scores.
 
-Controls are made of the same images under the same protocol, without learning: an untrained encoder of the
-same architecture (several seeds), principal components and the pixels themselves. Tables of identity and
-class also have descriptors, of the image alone and averaged with those of its mirror image: whitened features
-see both.
+Controls are made of the same images without learning: an untrained encoder of the same architecture (several
+seeds), principal components and the pixels themselves. Tables of identity and class also have descriptors, of
+the image alone and averaged with those of its mirror image: whitened features see both.
 """
 
 from collections import defaultdict

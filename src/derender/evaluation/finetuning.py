@@ -1,13 +1,11 @@
 """Joint training as a task of the training loop: the rendering objective and labels, one total.
 
-Source: Klinghoffer et al., ECCV 2022, Sec. 3.1, where it is future work ("jointly train a learned
-representation with the target task in mind"). Images without a label take part in the rendering objective
-alone. Held-out images are judged by the labels, which so choose the saved weights.
+Source: Klinghoffer et al., ECCV 2022, Sec. 3.1, as future work. Images without a label take part in the
+rendering objective alone. Held-out images are judged by the labels, which so choose the saved weights.
 
-The test part of the run's own split is scored; neither training nor the choice of weights saw it. The heads
-on frozen features (the paper's, and penalised logistic regression) learn from the very same labels. So does
-the regression on features of an untrained encoder, on principal components and on pixels. Leaves out weights
-of classes, and a rate of its own for the head.
+The test part of the run's own split is scored; neither training nor the choice of weights saw it. Heads on
+frozen features and on controls learn from the very same labels. Leaves out weights of classes, and a rate of
+its own for the head.
 """
 
 import copy

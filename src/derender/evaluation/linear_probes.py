@@ -7,14 +7,12 @@ the share of each value among the training rows, knows no image.
 The paper's head (Klinghoffer et al., ECCV 2022, Sec. 4.4) is one linear layer, sigmoid with binary
 cross-entropy (here also softmax with cross-entropy for classes), Adam 2e-4, 100 epochs, threshold 0.5. The
 batch size is not stated; 64 is that of the paper's other trainings. So few small steps leave the head near
-its random start: it measures the features' scale as much as their content. The bias moves by 0.3 at most, so
-that features can lean on their mean to answer with the majority; ``centred`` treats all alike.
+its random start: it measures the features' scale as much as their content, and leans on their mean.
 
 The objective of the penalised regression is scikit-learn's: C times the sum of the losses plus half the
-squared weights, intercept free. All labels and folds of one penalty are solved together. The rows are rotated
-onto their principal axes: 12,288 pixels of 1,000 rows become 1,000 numbers, and nothing changes under this
-penalty. There the curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps scaled by
-it need only two matrix products each.
+squared weights, intercept free. All labels and folds of one penalty are solved together, on principal axes.
+There the curvature has a diagonal bound (Boehning and Lindsay 1988), and accelerated steps scaled by it need
+only two matrix products each.
 """
 
 from collections.abc import Sequence

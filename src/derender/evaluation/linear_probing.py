@@ -1,19 +1,17 @@
 """Linear protocol: how much does a linear head learn from features, given few labels?
 
-Source: Klinghoffer et al., ECCV 2022, Sec. 4.4. All features are asked the same questions of the same test
-    rows after learning from the same training rows, so differences are paired. A row's seeds are its
-    training rows; where features themselves come in several runs (an untrained encoder's weights), run and
-    training rows change together.
+Source: Klinghoffer et al., ECCV 2022, Sec. 4.4. All features are tested on the same rows after learning from
+the same training rows, so differences are paired. A row's seeds are its training rows; where features come in
+several runs (an untrained encoder's weights), run and training rows change together.
 
 Scores are averaged over labels (or classes). Accuracy rewards the majority's answer (0.80 on CelebA):
 balanced accuracy is 0.5 for any constant answer (one over the number of classes). Average precision needs no
 threshold, and is the label's share for answers that know nothing.
 
-Table 2's "Finetune" trains the encoders, too. They and the head share Adam 2e-4, 100 epochs and batches of
-64. The paper names no rate of the encoders' own. Of a baseline the whole network is
-trained; a ResNet-18 with fresh weights is the paper's supervised row. An untrained model under the same
-protocol is the control. Controls without an encoder have nothing below the head to train: theirs are the
-answers of the head alone. Leaves out the rendering objective beside the task (finetuning.py).
+Table 2's "Finetune" trains the encoders, too, of a baseline the whole network, with the head's Adam 2e-4, 100
+epochs and batches of 64. A ResNet-18 with fresh weights is the paper's supervised row, an untrained model the
+control. Controls without an encoder are the head alone. Leaves out the rendering objective beside the task
+(finetuning.py).
 """
 
 import copy

@@ -1,8 +1,8 @@
 """Results that took long, cached in a folder by the content of their inputs.
 
-A file is named after a hash of the arrays and settings that decide the result, so no entry is ever outdated:
-other features or settings are another file. An interrupted table continues where it stopped. Files are
-``.npz`` without objects, so reading one runs no code (joblib.Memory reads pickles).
+A file is named after a hash of the arrays and settings that decide the result, so no entry is ever outdated.
+An interrupted table continues where it stopped. Files are ``.npz`` without objects, so reading one runs no
+code (joblib.Memory reads pickles).
 """
 
 import dataclasses

@@ -2,11 +2,11 @@
 
 Distances are made in blocks with one matrix product each, in a copy of the rows and 64 MB. Equally near rows:
 the first counts. Above ``EXACT_ROWS`` rows a row is compared with those of its own cell and of the
-``NEAR_CELLS`` nearest ones, in float32. So work grows with the rows and not with their square.
+``NEAR_CELLS`` nearest ones, in float32: work grows with the rows and not with their square.
 
 ``cells`` puts near rows together. Centres come from a few rounds of k-means (Lloyd 1982) over a sample; every
-row goes to its nearest centre. Cells that came out too large are divided again. Approximate by nature: rows
-on two sides of a border do not see each other.
+row goes to its nearest centre. Cells that came out too large are divided again. Rows on two sides of a border
+do not see each other.
 """
 
 from collections.abc import Callable, Iterator, Sequence

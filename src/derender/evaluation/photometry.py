@@ -7,9 +7,8 @@ share of that difference: 1 where light is the same for all groups, 0 where the 
 
 Relighting against photographs of known light, such as the cropped Extended Yale B. Each person's most frontal
 image takes the light that a model predicts for the next person's image in a light. The result is compared
-with the person's own image in that light, where the model draws a surface. Controls know the same two people:
-the image as it is, the mean image of all others in that light, and the image times the ratio of the other
-person's two. Leaves out cast shadows.
+with the person's own image in that light, where the model draws a surface. Controls know the same two people.
+Leaves out cast shadows.
 """
 
 from collections.abc import Mapping

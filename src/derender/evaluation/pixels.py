@@ -1,12 +1,12 @@
 """How well a model reconstructs images it has not seen: L1, PSNR and SSIM inside the mask, beside controls.
 
-Controls are the mean image; the images from 64 principal components of their pixels, which know no
-geometry; and an untrained model. The first two are scored inside the model's own masks. A low error alone
-proves nothing about geometry (a copied image has none): read it with evaluation/truth.py.
+Controls are the mean image and the images from 64 principal components of their pixels, inside the model's
+own masks, and an untrained model. A low error alone proves nothing about geometry (a copied image has none):
+read it with evaluation/truth.py.
 
 SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of 11 x 11 pixels with sigma
-1.5, mean over colours. The centre of a window that reaches over the edge of the mask is left out. So are five
-pixels at the border of the image. Leaves out several scales and learned similarities.
+1.5, mean over colours. Windows that reach over the edge of the mask or the image are left out. Leaves out
+several scales and learned similarities.
 """
 
 from collections.abc import Mapping

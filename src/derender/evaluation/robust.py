@@ -1,8 +1,8 @@
 """The robustness protocol: a probe learns in ordinary light and view and is tested at every angle.
 
 The area under a curve of accuracy over angle is divided by the range of angles: 0 to 1, best 1. Every seed
-learns from its own four fifths of the training rows. Units (see ``Trial``) are resampled for the intervals,
-the same for all features, angles and scores, so that differences are paired.
+learns from its own four fifths of the training rows. Units (see ``Trial``) are resampled, the same for all
+features, angles and scores, so that differences are paired.
 """
 
 from collections.abc import Collection, Mapping, Sequence

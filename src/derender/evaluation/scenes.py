@@ -67,11 +67,7 @@ def geometry(
     if {"albedo", "light", "camera"} <= set(known):
         protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **same)
     protocols["reconstruction"] = ReconstructionResult, again
-    result = _scored(model, protocols, {**known, "seed": how.seed, "steps": fit_steps or 0}, how)
-    if isinstance(factors := result.values.get("factors"), FactorResult):
-        parts = {"factors": replace(factors, untrained=None), "factors_untrained": factors.untrained}
-        result = replace(result, values={**result.values, **parts})
-    return result
+    return _scored(model, protocols, {**known, "seed": how.seed, "steps": fit_steps or 0}, how)
 
 
 def reconstruction(
@@ -97,14 +93,11 @@ def reconstruction(
     model = as_model(model, device=how.device)
     images = as_images(images, model.image_size, dataset=how.dataset, limit=how.limit)
     known = (training_images or images).images
-
-    def make() -> ReconstructionResult:
-        return evaluate_reconstruction(
-            optimised(model, fit_steps), images.images, mean=mean_image(known),
-            components_of=known[evenly(len(known))], untrained=untrained_twin(model, how.seed),
-            batch_size=batch_size, progress=how.progress,
-        )  # fmt: skip
-
+    make = partial(
+        evaluate_reconstruction, optimised(model, fit_steps), images.images, mean=mean_image(known),
+        components_of=known[evenly(len(known))], untrained=untrained_twin(model, how.seed),
+        batch_size=batch_size, progress=how.progress,
+    )  # fmt: skip
     inputs = {"images": images.images, "fitted": known, "seed": how.seed, "steps": fit_steps or 0}
     result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, how)
     intervals = result.values["intervals"]["reconstruction"]

@@ -28,6 +28,7 @@ from derender.evaluation.segmenters import TEST_FRACTION, SegmentationData, Segm
 from derender.features import model_fingerprint
 from derender.features.extract import check_size
 from derender.inputs import as_model
+from derender.storage.places import counted
 
 SHOWN = 8
 TOP = 10
@@ -94,11 +95,11 @@ class SegmentationComparison:
     def tables(self) -> list[ScoreTable]:
         """Scores, verdicts, the IoU of every class, and the paper's rows."""
         data, scored = self.data, [row.scored for row in self.rows]
-        share, count = data.shares(data.test), len(self.seeds)
+        share = data.shares(data.test)
         caption = (
             f"segmentation: {len(data.train):,} images learned, {len(data.test):,} tested (by {data.split}), "
             f"{(share > 0).sum()} of {len(data.classes)} classes tested, {self.settings.epochs} epochs, "
-            f"{count} seed{'s' if count > 1 else ''}"
+            f"{counted(len(self.seeds), 'seeds')}"
         )
         trainable = {row.scored.name: row.trainable for row in self.rows}
         learn = Column("learn", note="number of trained weights")

@@ -1,10 +1,9 @@
 """What is compared in face segmentation: divided images with masks, networks and their training, controls.
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4.7 and Table 3: Adam 2e-4 with betas 0.5 and 0.999, 20 epochs.
-Neither the loss nor the batch size is stated: cross-entropy, and 64, or fewer of few images. To the paper's
-control, one encoder from fresh weights, this table adds two fresh encoders. A pre-trained encoder keeps its
-BatchNorm statistics while its weights learn. One network begins with the decoder that was distilled beside
-the encoders. Leaves out augmentation, class weights and early stopping.
+Neither the loss nor the batch size is stated: cross-entropy, and 64, or fewer of few images. Two fresh
+encoders stand beside the paper's control, a single one. A pre-trained encoder keeps its BatchNorm statistics
+while its weights learn. Leaves out augmentation, class weights and early stopping.
 
 Controls without a network learn from the training images only. Faces are aligned, so the most frequent class
 at a place already draws a face; principal components also hold its pose.

@@ -1,18 +1,18 @@
 """Trials: images, their task, training rows, and test rows at growing angles of light or camera.
 
 Every curve names rows of one stack of images, so that features are computed once for all of it. Turning the
-camera leaves the light where it is, turning the light leaves ambient and diffuse. Angles are degrees because
-axes of charts show them; 0 is the front. Leaves out every score. There are three sources of images:
+camera leaves the light where it is, turning the light leaves ambient and diffuse. Angles are degrees; 0 is
+the front. Leaves out every score. There are three sources of images.
 
-generated  Light and view were set; all else depends on seed and index alone. Each image is shown from both
-           sides. Probes learn in the generator's usual light and view. For identity other images of the same
-           people are tested, for any other label other people.
-rendered   Real images are decomposed and re-rendered by a model. Training images are renderings too, each in
-           its own light and view. Angles are the model's own, and its features have an advantage: read it
-           beside generated images.
-true       The unit is the track where there are tracks, else the image. Of every class, the less rotated
-           half of its units is ordinary: three of four learn, the fourth is tested as the curve's first
-           point. The other half is tested in portions, by growing angle.
+Generated: light and view were set, all else depends on seed and index alone. Each image is shown from both
+sides. For identity other images of the same people are tested, for any other label other people.
+
+Rendered: real images are decomposed and re-rendered by a model, training images each in its own light and
+view. Angles are the model's own, and its features have an advantage: read it beside generated images.
+
+True: the unit is the track where there are tracks, else the image. Of every class, the less rotated half of
+its units is ordinary: three of four learn, the fourth is tested as the curve's first point. The other half is
+tested in portions, by growing angle.
 """
 
 import math

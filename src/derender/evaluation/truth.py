@@ -5,16 +5,17 @@ input image where predicted and true mask overlap. SIDE is the standard deviatio
 true depth, so a global scale costs nothing. MAD is the mean angle between normals. The overlap is eroded by
 one pixel, since rasterisers differ at the rim: pixels stay whose four neighbours are inside.
 
-An image fixes albedo only up to a factor that the light compensates, and the canonical frame only up to one
-rotation for the whole model. So albedo is compared after the best scale per image, and after the best one
-for the whole set; light, in the frame of the camera, as it is and after the best rotation for the set; camera
-rotation after the best rotation for the set. Leaves out translations: at 10 degrees of field of view they
-trade against depth.
+An image fixes albedo only up to a factor that the light compensates. It fixes the canonical frame only up to
+one rotation for the whole model. So albedo is compared after the best scale, per image and for the whole set.
+Light, in the frame of the camera, is compared as it is and after the best rotation for the set. Camera
+rotation is compared after the best one. Leaves out translations: at 10 degrees of field of view they trade
+against depth.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Optional
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -188,14 +189,30 @@ class AngleScores:
 
 
 @dataclass(frozen=True)
-class FactorResult(ImageResult):
-    """A model's errors in albedo, light and camera, each beside the best constant answer.
+class FactorScores:
+    """Errors of albedo, light and camera, best 0: means over images, and (N,) values of each.
 
-    ``albedo`` is the mean of ``albedo_error`` in the view of the image (control: the mean true albedo).
-    ``albedo_global`` is that after one scale for all images: confusing bright skin under weak light with dark
-    skin under strong light costs. ``light_aligned`` is after the best rotation of all predictions at once;
-    its control is ``light_control``, too, the mean true direction. The control of ``camera`` never turns.
-    Values per image are (N,). ``untrained`` has fresh weights.
+    ``albedo`` is ``albedo_error`` in the view of the image, ``albedo_global`` that after one scale for all
+    images: confusing bright skin under weak light with dark skin under strong light costs. ``light``,
+    ``aligned`` (after the best rotation of all predictions at once) and ``camera`` are degrees, 0..180.
+    """
+
+    albedo: float
+    albedo_global: float
+    light: float
+    aligned: float
+    camera: float
+    albedo_each: np.ndarray
+    albedo_global_each: np.ndarray
+    light_each: np.ndarray
+    aligned_each: np.ndarray
+    camera_each: np.ndarray
+
+
+@dataclass(frozen=True)
+class FactorResult(ImageResult):
+    """A model's errors in albedo, light and camera beside the best constant answer, and fresh weights (None
+    without an architecture).
     """
 
     columns: ClassVar[Mapping[str, Column]] = {
@@ -206,37 +223,16 @@ class FactorResult(ImageResult):
         "camera": Column("camera", "low", 1, _CAMERA),
     }
     caption = "Albedo, light and camera on {}"
+    titles: ClassVar[Mapping[str, str]] = {
+        "model": "model", "constant": "constant answer", "untrained": "untrained model"
+    }  # fmt: skip
     notes: ClassVar[Mapping[str, str]] = {
         "constant answer": "mean albedo, mean light, a camera that never turns"
     }
 
-    albedo: float
-    albedo_control: float
-    albedo_global: float
-    albedo_global_control: float
-    light: AngleScores
-    light_control: AngleScores
-    light_aligned: AngleScores
-    camera: AngleScores
-    camera_control: AngleScores
-    albedo_each: np.ndarray
-    albedo_global_each: np.ndarray
-    albedo_control_each: np.ndarray
-    albedo_global_control_each: np.ndarray
-    untrained: Optional["FactorResult"] = None
-
-    def each(self) -> dict[str, dict[str, np.ndarray]]:
-        """By row: the model, the best constant answers, an untrained model."""
-
-        def own(one: FactorResult) -> tuple[np.ndarray, ...]:
-            angles = (one.light, one.light_aligned, one.camera)
-            return (one.albedo_each, one.albedo_global_each, *(angle.each_deg for angle in angles))
-
-        light, camera = self.light_control.each_deg, self.camera_control.each_deg
-        constant = (self.albedo_control_each, self.albedo_global_control_each, light, light, camera)
-        result = {"model": own(self), "constant answer": constant}
-        result |= {} if self.untrained is None else {"untrained model": own(self.untrained)}
-        return {row: dict(zip(self.columns, each, strict=True)) for row, each in result.items()}
+    model: FactorScores
+    constant: FactorScores
+    untrained: FactorScores | None = None
 
 
 def albedo_error(
@@ -306,37 +302,38 @@ def evaluate_factors(
         if getattr(truth, name) is None:
             raise ValueError(f"this ground truth has no {name}: give a set that stores it")
     check_size(model, truth.images, rendered=True)
+    true, true_mask = torch.as_tensor(truth.albedo), torch.as_tensor(truth.mask)
+    exact = torch.as_tensor(truth.light), torch.as_tensor(truth.camera)
 
-    def see(batch: Tensor) -> tuple[Tensor, ...]:
+    def see(net: Any, batch: Tensor) -> tuple[Tensor, ...]:
         """Albedo and mask in the image's view (rendered under plain ambient light), light, camera."""
-        scene = model.decompose(batch)
+        scene = net.decompose(batch)
         white = torch.tensor([1.0, 0.0, 0.0, 0.0], device=batch.device).expand_as(scene.light)
-        flat = model.render(scene.with_parameters(light=white))
+        flat = net.render(scene.with_parameters(light=white))
         return flat.image.cpu(), flat.mask.cpu() > 0.5, scene.light.cpu(), scene.camera.cpu()
 
-    parts = map_batches(see, model, truth.images, batch_size=batch_size)
-    albedo, mask, light, camera = map(torch.cat, zip(*parts, strict=True))
-    true, true_mask = torch.as_tensor(truth.albedo), torch.as_tensor(truth.mask)
-    true_light, true_camera = torch.as_tensor(truth.light), torch.as_tensor(truth.camera)
-    both = mask & true_mask
-    if not bool(both.any()):
-        raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
-    constant = (true.sum(dim=0) / true_mask.sum(dim=0).clamp_min(1)).expand_as(true)
-    direction = light_in_camera(true_light, true_camera)
-    return FactorResult(
-        **means_and_each(
-            albedo=albedo_error(albedo, true, both),
-            albedo_global=albedo_error(albedo, true, both, one_scale=True),
-            albedo_control=albedo_error(constant, true, true_mask),
-            albedo_global_control=albedo_error(constant, true, true_mask, one_scale=True),
-        ),
-        light=light_error(light, camera, true_light, true_camera),
-        light_control=_angles(angle_deg(direction.mean(dim=0).expand_as(direction), direction)),
-        light_aligned=light_error(light, camera, true_light, true_camera, aligned=True),
-        camera=camera_error(camera, true_camera),
-        camera_control=camera_error(torch.zeros_like(true_camera), true_camera),
-        untrained=None if untrained is None else evaluate_factors(untrained, truth, batch_size=batch_size),
-    )
+    def scored(albedo: Tensor, mask: Tensor, *angles: Tensor | np.ndarray) -> FactorScores:
+        errors = (albedo_error(albedo, true, mask, one_scale=one_scale) for one_scale in (False, True))
+        each = map(torch.as_tensor, (*errors, *angles))
+        return FactorScores(**means_and_each(**dict(zip(FactorResult.columns, each, strict=True))))
+
+    def of(net: Any) -> FactorScores:
+        parts = map_batches(partial(see, net), net, truth.images, batch_size=batch_size)
+        albedo, mask, light, camera = map(torch.cat, zip(*parts, strict=True))
+        if not bool((both := mask & true_mask).any()):
+            raise ValueError(
+                "prediction and truth share no pixel in any image: check the camera or the masks"
+            )
+        both_ways = (light_error(light, camera, *exact, aligned=one) for one in (False, True))
+        lights = (one.each_deg for one in both_ways)
+        return scored(albedo, both, *lights, camera_error(camera, exact[1]).each_deg)
+
+    mean = (true.sum(dim=0) / true_mask.sum(dim=0).clamp_min(1)).expand_as(true)
+    direction = light_in_camera(*exact)
+    off = angle_deg(direction.mean(dim=0).expand_as(direction), direction)
+    still = camera_error(torch.zeros_like(exact[1]), exact[1]).each_deg
+    constant = scored(mean, true_mask, off, off, still)
+    return FactorResult(of(model), constant, None if untrained is None else of(untrained))
 
 
 def light_in_camera(light: Float[Tensor, "n 4"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:

@@ -13,6 +13,7 @@ import numpy as np
 from derender.evaluation.score_table import Cell, Column, Interval, Row, ScoreTable, interval_column
 from derender.interpretation.attribution import CHANGES, UNCHANGED, Similarity
 from derender.interpretation.probe import Probe
+from derender.storage.places import counted
 
 Features = Mapping[str, np.ndarray]
 
@@ -204,10 +205,9 @@ def share_table(result: Explanation) -> ScoreTable:
         return [*shown, *_means(row.auc[..., None], answer)]
 
     what = "yes/no labels" if result.kind == "labels" else "classes, each on its own images"
-    seeds = len(model.shares)
     caption = (
         f"Share of each factor in the answer: {result.head} probe of {result.n_train:,} images, "
-        f"{result.n_test:,} held out, {seeds} seed{'s' if seeds > 1 else ''}, {len(result.names)} {what}; "
+        f"{result.n_test:,} held out, {counted(len(model.shares), 'seeds')}, {len(result.names)} {what}; "
         f"{result.output} from a {result.baseline} baseline, completeness error {model.error:.1e}"
     )
     return _answers(result, caption, [*columns, AUC], cells)

@@ -194,9 +194,8 @@ def _scores(subject: Subject) -> Values:
 def _card(subject: Subject) -> Values:
     """The disentanglement card from one seed, without scores by dimension."""
     sample = _sample(subject.held_out, CARD)
-    result = disentangle(
-        subject.model, sample, seeds=(0,), dimensions=None, swap_images=min(64, len(sample)), cache="none"
-    )
+    how = {"seeds": (0,), "dimensions": None, "swap_images": min(64, len(sample)), "cache": "none"}
+    result = disentangle(subject.model, sample, **how)
     sheet = matrix_sheet(card_matrices(result.result))
     return {"notes": ". ".join(result.notes[:2]), "tables": result.tables[:3], "matrices": sheet}
 

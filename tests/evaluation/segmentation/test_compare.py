@@ -10,18 +10,10 @@ from tests.evaluation.segmentation.conftest import NAMES, bands
 from torchmetrics.functional.classification import multiclass_accuracy, multiclass_jaccard_index
 
 from derender import Derenderer
+from derender.evaluation import segmenters
 from derender.evaluation.memory import Memory
 from derender.evaluation.segmentation import COLUMNS, class_iou, count_pixels, resampled_scores, segment
-from derender.evaluation.segmenters import (
-    VARIANTS,
-    SegmentSettings,
-    answer,
-    build_variant,
-    by_components,
-    divide,
-    most_frequent_at_place,
-    train_segmenter,
-)
+from derender.evaluation.segmenters import VARIANTS, SegmentSettings, build_variant, by_components, divide
 
 DOUBLE = np.ones((2, 2), np.uint8)
 QUICK = SegmentSettings(learning_rate=1e-2, epochs=6, batch_size=4)
@@ -34,7 +26,7 @@ def mean_iou(answers, data) -> float:
 
 def test_controls_answer_what_they_may_know(data):
     truth = data.masks[data.test]
-    place = most_frequent_at_place(data)
+    place = segmenters.most_frequent_at_place(data)
     column = [np.bincount(data.masks[data.train, row, 7]).argmax() for row in range(32)]
     assert (place == place[0]).all() and (place[0, :, 7] == column).all()
     blind = replace(data, images=np.full_like(data.images, 90))
@@ -48,9 +40,9 @@ def test_controls_answer_what_they_may_know(data):
 def test_a_net_learns_and_leaves_the_model_alone(name, data, model, before):
     net = build_variant(model, VARIANTS[name], data, seed=0)
     told = []
-    losses = train_segmenter(net, data, 0, QUICK, lambda seen, loss: told.append(seen))
+    losses = segmenters.train_segmenter(net, data, 0, QUICK, lambda seen, loss: told.append(seen))
     assert losses[-1] < losses[0] and told[-1] == 6 * len(data.train)
-    assert mean_iou(answer(net, data.images[data.test]), data) > 0.5
+    assert mean_iou(segmenters.answer(net, data.images[data.test]), data) > 0.5
     frozen = build_variant(model, VARIANTS[name], data, seed=0)
     pairs = zip(net.encoders.parameters(), frozen.encoders.parameters(), strict=True)
     assert all(torch.equal(*pair) for pair in pairs) == VARIANTS[name].frozen

@@ -2,9 +2,8 @@
 
 Controls: the same networks untrained, with fresh weights for each seed. The model's own features with the
 rows of each factor shuffled, which gives chance. Random pixel values, and whitened principal components,
-split into as many blocks as there are features; they need no encoder. The swap test needs a decoder, so only
-the model and the untrained one have it. Without true factors among the labels that part is left out. A
-majority's answer has no features; it is the chance of every class.
+split into as many blocks as there are features. The swap test needs a decoder, so only the model and the
+untrained one have it. Without true factors among the labels that part is left out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,6 +35,7 @@ from derender.evaluation.score_table import Cell, Column, Interval, Row, Scores,
 from derender.features import embed_images, model_fingerprint
 from derender.features.table import check_finite
 from derender.inputs import as_images, as_model
+from derender.storage.places import counted
 
 MODEL = "model"
 MIN_IMAGES = 20
@@ -127,8 +127,7 @@ class DisentanglementCard:
 
     def tables(self) -> list[ScoreTable]:
         """The summary, the swap test's matrices, and where true factors are known the scores against them."""
-        truth, count = self.rows[MODEL][0].truth, len(self.rows[MODEL])
-        seeds = "1 seed" if count == 1 else f"{count} seeds"
+        truth, seeds = self.rows[MODEL][0].truth, counted(len(self.rows[MODEL]), "seeds")
         caption = (
             f"Disentanglement: {', '.join(self.features)} of {self.n_pictures:,} images, mean over "
             f"{seeds} of all pairs; low correlation alone proves nothing, read it with the swap test"

@@ -6,10 +6,10 @@ the weights of DCI and 20 bins for MIG as in Locatello et al., ICML 2019.
 Each score is computed twice. *By feature*, a whole feature counts for its held-out predictions (ridge, in
 similarity.py): R2 of a number; of a class, accuracy above that of the largest class, over the possible gain.
 This is blind to rotations inside a feature, and the score to read. *By dimension*, as published, dimensions
-compete: a factor spread over two dimensions of the right feature costs as much as one held by two features.
+compete: a factor spread over two dimensions of one feature costs as much as one held by two features.
 
-All are 0..1 and best at 1; uninformative features score about 0. ``placed`` asks whether the right feature
-holds a factor. True factors are the labels of a rendered set: numbers, or names as classes.
+All are 0..1 and best at 1; uninformative features score about 0. True factors are the labels of a rendered
+set: numbers, or names as classes.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
