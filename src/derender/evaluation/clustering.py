@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from derender.evaluation import bootstrap
+from derender.evaluation import bootstrap, feature_rows
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch
 from derender.evaluation.clustering_scores import (
     CLUSTER_COLUMNS,
@@ -27,13 +27,6 @@ from derender.evaluation.clustering_scores import (
     encoded,
     scores_of_counts,
 )
-from derender.evaluation.feature_rows import (
-    FeatureSource,
-    check_lengths,
-    chosen_labels,
-    prepare,
-    subject_and_controls,
-)
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, judged_tables, verdict
@@ -41,7 +34,7 @@ from derender.features import missing
 
 
 def cluster(
-    features: FeatureSource,
+    features: feature_rows.FeatureSource,
     label: str | Sequence[str] | None = None,
     *,
     attributes: bool = False,
@@ -68,10 +61,10 @@ def cluster(
         ValueError: labels, factors or images do not fit.
     """
     how = Options.of(options, descriptors=label in ("identity", ["identity"], "class", ["class"]))
-    rows = subject_and_controls(features, how)
-    names, left_out = chosen_labels(rows[0].tables[0], label, attributes)
+    rows = feature_rows.subject_and_controls(features, how)
+    names, left_out = feature_rows.chosen_labels(rows[0].tables[0], label, attributes)
     mean_by = (mean_by,) if isinstance(mean_by, str) else mean_by
-    ready = prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)
+    ready = feature_rows.prepare(rows, names, mean_by=mean_by, min_count=min_count, max_count=max_count)
     result = compare_clusterings(**ready.asked, method=method, n_clusters=clusters, **how.scoring)
     tables = clustering_tables(result, "Above the strongest control? (paired resamples of the rows)")
     levels = {}
@@ -138,7 +131,7 @@ def compare_clusterings(
     if not labels or not features or not all(features.values()):
         raise ValueError("clustering needs at least one label and one array of features in each row")
     columns = {name: np.asarray(values) for name, values in labels.items()}
-    check_lengths(features, len(next(iter(columns.values()))))
+    feature_rows.check_lengths(features, len(next(iter(columns.values()))))
     labelled = ~np.all([missing(values) for values in columns.values()], axis=0)
     numbers = {name: _numbered(values[labelled], name) for name, values in columns.items()}
     sizes = {name: int(values.max()) + 1 for name, values in numbers.items()}

@@ -25,15 +25,6 @@ from derender.inputs import as_images, as_model
 from derender.interpretation import tables
 from derender.interpretation.attribution import Similarity, captum_attr, factor_shares, integrated_gradients
 from derender.interpretation.probe import Probe, fit_probe, question
-from derender.interpretation.tables import (
-    ClusterShares,
-    Explanation,
-    Features,
-    PairParts,
-    ShareRow,
-    cluster_shares,
-    pair_parts,
-)
 from derender.storage.places import require_known
 
 BASELINES = ("zero", "mean")
@@ -50,13 +41,13 @@ class Explained:
     ``left_out`` are notes on yes/no labels with too few images of one answer.
     """
 
-    shares: Explanation
+    shares: tables.Explanation
     model: Any
     images: ImageSet
     task: Task
     split: Rows
-    clusters: ClusterShares | None = None
-    pair: tuple[tuple[str, str], PairParts] | None = None
+    clusters: tables.ClusterShares | None = None
+    pair: tuple[tuple[str, str], tables.PairParts] | None = None
     checks: Sequence[Similarity] = ()
     left_out: Sequence[str] = ()
 
@@ -146,9 +137,9 @@ def explain(
     apart = alike = None
     if clusters is not None:
         made = clusterings(table.concatenate(), [clusters], seed=seed)[clusters]
-        apart = cluster_shares(table.factors, made, seed=seed)
+        apart = tables.cluster_shares(table.factors, made, seed=seed)
     if pair is not None:
-        alike = pair, pair_parts(table.factors, *map(images.files.index, pair), seed=seed)
+        alike = pair, tables.pair_parts(table.factors, *map(images.files.index, pair), seed=seed)
     return Explained(shares, net, images, task, split, apart, alike, left_out=left_out)
 
 
@@ -168,17 +159,17 @@ def split_rows(
 
 
 def explain_labels(
-    features: Features,
+    features: tables.Features,
     task: Task,
     split: Rows,
     *,
-    untrained: Sequence[Features] = (),
+    untrained: Sequence[tables.Features] = (),
     seeds: Sequence[int] = (0, 1, 2),
     head: str = "logistic",
     output: str = "logit",
     baseline: str = "zero",
     progress: Callable[[int, int], object] | None = None,
-) -> Explanation:
+) -> tables.Explanation:
     """Shares of each factor, (N, D_f) by name, in the answers to a task, with controls.
 
     ``split`` has one number of training rows and S choices, for the S ``seeds`` of probes and shuffled
@@ -209,7 +200,7 @@ def explain_labels(
                 progress(sum(map(len, runs.values())), total)
     first, shuffled = (runs[name][0][0] for name in ("model", "shuffled labels"))
     shares = tuple(_row(name, [result for _, *result in own]) for name, own in runs.items() if own)
-    return Explanation(
+    return tables.Explanation(
         task.kind, task.names, first.factors, shares, first, shuffled, count, len(split.test), head, output,
         baseline,
     )  # fmt: skip
@@ -254,7 +245,7 @@ def _auc(targets: np.ndarray, logits: np.ndarray, kind: str) -> np.ndarray:
     return result
 
 
-def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> ShareRow:
+def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> tables.ShareRow:
     shares, largest, auc, drop = map(np.stack, zip(*runs, strict=True))  # shares: (S, T, A, F)
     known = np.ma.masked_invalid(shares)
     each = known.mean(axis=0).filled(np.nan)  # of images
@@ -264,4 +255,5 @@ def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> ShareRow:
     low, high = ends.T.reshape(2, *each.shape[1:])
     error, scale = largest.max(axis=0)
     error = float(error / scale) if scale > 0 else 0.0
-    return ShareRow(name, name != "model", known.mean(axis=1).filled(np.nan), low, high, auc, drop, error)
+    means = known.mean(axis=1).filled(np.nan)
+    return tables.ShareRow(name, name != "model", means, low, high, auc, drop, error)
