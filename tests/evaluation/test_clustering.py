@@ -171,16 +171,13 @@ def test_tables_show_scores_intervals_and_the_strongest_control():
     assert values["noise"]["95 %"].low < values["noise"]["accuracy"] < values["noise"]["95 %"].high
     assert [row.name for row in judged.rows] == [f"ours: {c.name}" for c in CLUSTER_COLUMNS.values()]
     rival = result.rows[0].versus["accuracy"].rival
-
-    def words(row, score):
-        return verdict(row, score, CLUSTER_COLUMNS[score])
-
+    accuracy, nmi, ari = (CLUSTER_COLUMNS[score] for score in ("accuracy", "nmi", "ari"))
     assert judged.values()["ours: accuracy"]["strongest control"] == rival
     assert judged.values()["ours: accuracy"]["above"] == "yes"
-    assert f"better than the strongest control ({rival})" in words(result.rows[0], "accuracy")
-    assert words(result.rows[1], "nmi").startswith("noise: NMI 0.")
+    assert f"better than the strongest control ({rival})" in verdict(result.rows[0], "accuracy", accuracy)
+    assert verdict(result.rows[1], "nmi", nmi).startswith("noise: NMI 0.")
     same = compare({"ours": features["noise"], "noise": features["noise"]}, {"who": who}).rows[0]
-    assert any(word in words(same, "ari") for word in ("not distinguished from", "worse than"))
+    assert any(word in verdict(same, "ari", ari) for word in ("not distinguished from", "worse than"))
 
 
 def test_a_metric_declared_once_is_scored_judged_and_shown(monkeypatch):
