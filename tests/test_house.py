@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_690, 15),
     "features": (1_390, 8),  # a folder is refused before images are embedded
     "interpretation": (1_075, 5),
-    "photo": (1_595, 7),  # over-exposed skin; why a photograph does not suit a model
+    "photo": (1_615, 7),  # over-exposed skin; why a photograph does not suit a model; its scene
     "networks": (710, 5),
     "storage": (965, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_685, 242)  # on the way to (37_000, 270)
-TEST_LINES = 26_050
+TOTAL = (39_705, 242)  # on the way to (37_000, 270)
+TEST_LINES = 26_060
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from derender.interpretation import explain
     from derender.learn import finetune, refine, train, unet, whiten
     from derender.model import Derenderer, load
-    from derender.photo import align, relight, rotate
+    from derender.photo import align, decompose, relight, rotate
     from derender.scene import Scene
 
 __version__ = "0.1.0"
@@ -25,7 +25,7 @@ _NAMES = {
     "scene": ("Scene",),
     "data.doctor": ("doctor",),
     "features": ("FeatureTable", "DisentangledFeatures", "embed", "embed_to_file", "search"),
-    "photo": ("align", "relight", "rotate"),
+    "photo": ("align", "decompose", "relight", "rotate"),
     "learn": ("train", "whiten", "refine", "unet", "finetune"),
     "evaluation": ("compare",),
     "interpretation": ("explain",),
@@ -39,8 +39,8 @@ _SUBMODULES = [
 
 __all__ = [
     "Derenderer", "DisentangledFeatures", "FeatureTable", "Scene", "__version__", "align", "compare",
-    "doctor", "embed", "embed_to_file", "evaluate", "explain", "finetune", "load", "refine", "relight",
-    "rotate", "search", "train", "unet", "whiten",
+    "decompose", "doctor", "embed", "embed_to_file", "evaluate", "explain", "finetune", "load", "refine",
+    "relight", "rotate", "search", "train", "unet", "whiten",
 ]  # fmt: skip
 
 

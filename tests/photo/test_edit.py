@@ -96,6 +96,16 @@ def test_scenes_are_optimised_before_they_are_edited(photo, model):
     assert torch.equal(open_photograph(np.asarray(photo), unable).scene.light, light(0))
 
 
+def test_the_scene_of_a_photograph_is_that_of_its_edits(photo, model):
+    pixels = np.asarray(photo)
+    scene = derender.decompose([photo, pixels[None]], model)
+    assert len(scene) == 2 and scene.depth.shape[-1] == model.image_size
+    alone = open_photograph(pixels, model, fit_steps=0).scene
+    torch.testing.assert_close(scene[0].depth, alone.depth)
+    optimised = derender.decompose(photo, model, fit_steps=FIT_STEPS)
+    assert torch.equal(optimised.light, open_photograph(pixels, model).scene.light)
+
+
 def test_no_turn_and_its_own_light_return_the_photograph(photo, model):
     for same in (derender.rotate(photo, model, yaw_deg=0), derender.relight(photo, model, like=photo)):
         assert np.abs(np.asarray(same).astype(int) - np.asarray(photo)).max() <= 1

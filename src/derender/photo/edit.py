@@ -1,4 +1,4 @@
-"""A photograph in, a photograph out: relit or turned, in its own detail and at its own size.
+"""A photograph in, a photograph out: relit or turned, in its own detail and at its own size; or its scene.
 
 The part that suits the model is found: a face, or the middle. It is decomposed, drawn under another light or
 from another side by ``PhotoDetail``, and put back into the photograph. Results have the kind of what was
@@ -136,12 +136,19 @@ def open_photograph(
         frame: as `found_frame` takes it. A photograph that does not suit the model is a warning.
         fit_steps: as `editable_scenes` takes them.
     """
+    place, small = _cut_out(pixels, model, frame)
+    return Photograph.of(pixels, place, editable_scenes(model, small, fit_steps), model)
+
+
+def _cut_out(
+    pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, frame: str | None
+) -> tuple[Frame, Float[Tensor, "1 3 s s"]]:
+    """The part of a photograph that suits the model, and its pixels at the model's size."""
     place, _, doubt = found_frame(pixels, model, frame)
     if doubt:
         warnings.warn(f"{doubt}; choose frame auto or none if that is meant", stacklevel=2)
-    own = model.image_size
-    small = torch.from_numpy(place.cut(pixels, own)[None]).to(model.device).float() / 255
-    return Photograph.of(pixels, place, editable_scenes(model, small, fit_steps), model)
+    own = torch.from_numpy(place.cut(pixels, model.image_size)[None])
+    return place, own.to(model.device).float() / 255
 
 
 def editable_scenes(model: Derenderer, images: Float[Tensor, "n 3 h w"], steps: int | None = None) -> Scene:
@@ -155,6 +162,21 @@ def editing_steps(model: Derenderer, steps: int | None) -> int:
     if steps is not None and steps < 0:
         raise ValueError(f"fit_steps must be 0 or more, got {steps}")
     return steps if steps is not None else FIT_STEPS if model.fitting is not None else 0
+
+
+@torch.inference_mode()
+def decompose(
+    image: GivenImages, model: Derenderer | str | Path = "faces-64", *, frame: str | None = None,
+    fit_steps: int = 0,
+) -> Scene:  # fmt: skip
+    """Geometry, albedo, light and camera of photographs of any size: one scene for each.
+
+    Arguments are as in `relight`; ``fit_steps`` optimise the scenes. The maps have the model's size.
+    """
+    loaded = as_model(model)
+    given = image if isinstance(image, (list, tuple)) else [image]
+    parts = [_cut_out(photo, loaded, frame)[1] for one in given for photo in as_photos(one)]
+    return editable_scenes(loaded, torch.cat(parts), fit_steps)
 
 
 def relight(
