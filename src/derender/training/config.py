@@ -7,6 +7,7 @@ Source: the paper, Sec. 4 and its published settings. Where the two differ the s
 import json
 import math
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import yaml
@@ -189,38 +190,10 @@ class FinetuneConfig(TrainConfig):
 REMOVED: dict[str, Any] = {"objective.loocc_after": 0.0, "whitening.frames": 0, "whitening.reframe": ...}
 """Settings of earlier versions: runs that have them at this value (...: at any) still load."""
 
-_PRESET_CHANGES: dict[str, dict[str, Any]] = {
-    "paper": {
-        "objective": {
-            "perceptual": "vgg16", "curvature_weight": 0.0, "perceptual_rescaled": False, "loocc_joint": True,
-        },
-        "geometry_start": 1.0,
-        "whitening": {"pictures": 0},
-        "brightness": False,
-    },
-    "faces": {
-        "whitening": {  # for identity in any light: chosen on half of the people of Extended Yale B
-            "pictures": 6_000, "photographs": True, "gradients": True, "directions": 192, "shrinkage": 0.2,
-            "evenness": 0.3,
-        },
-    },
-    "cats": {},
-    "cars": {
-        "batch_size": 256,
-        "whitening": {"gradients": True},
-        "objective": {
-            "flip_weight": 1.0, "confidence": False, "perceptual_weight": 0.01, "smoothness_weight": 0.1,
-        },
-    },
-    "small": {
-        "batch_size": 16,
-        "images": 250_000,
-        "optimiser": {"learning_rate": 3e-4, "warmup_images": 4_000, "final_rate": 0.05},
-    },
-}  # fmt: skip
+_CHANGES = yaml.safe_load(Path(__file__).with_name("presets.yaml").read_text(encoding="utf-8"))
 PRESETS: dict[str, TrainConfig] = {
     name: TrainConfig.model_validate({"preset": name, "model": MODEL_PRESETS[name], **changes})
-    for name, changes in _PRESET_CHANGES.items()
+    for name, changes in _CHANGES.items()
 }
 
 

@@ -13,9 +13,11 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -27,7 +29,6 @@ from derender.training.distributed import ALONE, Ranks
 
 USUAL_BATCH = 16
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
-SLOW_GRACE_IMAGES = 14_000  # slow starts show pixel noise for longer, and recover
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
 MEMORY_IMAGES = 2_000  # over how many images measurements are averaged
 SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
@@ -61,42 +62,10 @@ class Sign:
         return measured > self.limit if self.above else measured < self.limit
 
 
-SIGNS = (
-    Sign(
-        "saturated depth", "depth_at_bound", 0.5, above=True, fatal=True, advice=SLOWER,
-        text="{value:.0%} of the depth values lie at the bounds of their range",
-    ),
-    Sign(
-        "torn depth", "depth_roughness", 0.6, above=True, fatal=True,
-        text="depth jumps from pixel to pixel ({value:.2f} of its spread; a smooth surface has below 0.3)",
-        advice=f"set curvature_weight=3, which removes stripes; {SLOWER}",
-        grace_images=SLOW_GRACE_IMAGES, usual_images=SLOW_GRACE_IMAGES,
-    ),
-    Sign(
-        "flat depth", "depth_spread", 0.03, above=False, fatal=False,
-        text="depth is flat (spread {value:.1%} of its range)",
-        advice="train longer; if it stays, the images may show too little variety of light and view",
-    ),
-    Sign(
-        "hollow depth", "bulge", -0.15, above=False, fatal=True,
-        text="surfaces are hollow: the middle lies {value:.0%} of the depth range behind the rim",
-        advice="start again with another seed; light from above in most images helps, upside-down ones hurt",
-    ),
-    Sign(
-        "view at its bound", "view_at_bound", 0.5, above=True, fatal=True, advice=SLOWER,
-        text="{value:.0%} of the images have the camera turned to its limit",
-    ),
-    Sign(
-        "light at its bound", "light_at_bound", 0.8, above=True, fatal=False,
-        text="{value:.0%} of the images have the light at the limit of its angles",
-        advice="look at the samples; a smaller learning_rate or a wider light_deg may help",
-    ),
-    Sign(
-        "albedo copies the image", "shading_contrast", 0.004, above=False, fatal=False,
-        text="shading is the same everywhere (contrast {value:.2%}), so albedo is the image itself",
-        advice="raise flip_weight, or check that images show the object from the front, roughly symmetric",
-    ),
-)  # fmt: skip
+_TABLE = yaml.safe_load(Path(__file__).with_name("signs.yaml").read_text(encoding="utf-8"))
+SIGNS = tuple(
+    Sign(name, **row | {"advice": row["advice"].format(slower=SLOWER)}) for name, row in _TABLE.items()
+)
 MEASURES = tuple(dict.fromkeys(sign.measure for sign in SIGNS))
 
 
