@@ -10,8 +10,7 @@ from safetensors.torch import save_file
 
 import derender
 from derender.data.synthetic import faces
-from derender.postprocess.fitting import Fitting, FittingSettings
-from derender.postprocess.morphable import MorphableMaps
+from derender.postprocess.fitting import Fitting, FittingSettings, MorphableMaps
 from derender.render import render_scene
 from derender.scene import Scene
 

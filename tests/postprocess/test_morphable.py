@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from derender.postprocess.morphable import MorphableMaps
+from derender.postprocess.fitting import MorphableMaps
 
 
 def planted(count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,8 +10,7 @@ from derender.evaluation.disentanglement.swap import swap_test
 from derender.features.extract import model_fingerprint
 from derender.postprocess import Features
 from derender.postprocess.embedding import HISTOGRAMS
-from derender.postprocess.fitting import Fitting, FittingSettings, coordinates_of
-from derender.postprocess.morphable import MorphableMaps
+from derender.postprocess.fitting import Fitting, FittingSettings, MorphableMaps, coordinates_of
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings, with_changes
 from derender.training.features import BATCH_SIZE, fit_whitening, make_features, make_fitting, photographs

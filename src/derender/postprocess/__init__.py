@@ -1,5 +1,5 @@
 """Encoder activations to features: whitening, and coordinates of scenes fitted per image at test time."""
 
-from derender.postprocess.features import Features
+from derender.postprocess.embedding import Features
 
 __all__ = ["Features"]

@@ -9,7 +9,8 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -20,13 +21,14 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, conv2d, pad
 from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
 from derender.networks.encoders import reduced
-from derender.postprocess.features import Features
-from derender.postprocess.fitting import STEPS, Fitted, coordinates_of
+from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
+from derender.postprocess.whitening import Whitening
 from derender.presets import ModelSettings
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior
 from derender.scene.camera import constant
+from derender.storage.places import FITTING_FILE, WHITENING_FILE
 
 FEW, MOST = 4, 64
 """Images in one call of a network, and in a portion: large ones take a third less time than fours."""
@@ -36,6 +38,74 @@ _DARK = 1 / 510  # half a grey level: shorter gradients are noise
 HISTOGRAM_CELLS, ORIENTATIONS = 10, 12  # of histograms of gradients: along each side, and in each
 HISTOGRAMS = HISTOGRAM_CELLS**2 * ORIENTATIONS
 Model = TypeVar("Model", bound="EmbeddingModel")
+
+
+@dataclass(frozen=True)
+class Features:
+    """Post-processing of encoder activations: without whitening a feature is the encoder output (the code).
+
+    Coordinates of scenes that the fitting finds follow, unless it makes 0 steps.
+    """
+
+    whitening: Whitening | None = None
+    fitting: Fitting | None = None
+
+    @property
+    def fits_scenes(self) -> bool:
+        """Whether features hold coordinates of fitted scenes."""
+        return self.fitting is not None and self.fitting.settings.steps > 0
+
+    def mirrors(self, factor: str) -> bool:
+        """Whether a factor's feature is made of an image and of its mirror image."""
+        return self.whitening is not None and factor in self.whitening.mirrored
+
+    def __call__(
+        self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]
+    ) -> dict[str, Float[Tensor, "n _"]]:
+        """Features by factor, of encoder outputs and activations; codes alone may be a ValueError."""
+        features = {**codes, **(self.whitening(activations) if self.whitening is not None else {})}
+        if self.fitting is not None:
+            for name in [name for name in features if coordinates_of(name) in activations]:
+                fitted = self.fitting.features(activations[coordinates_of(name)])
+                features[name] = torch.cat([features[name], fitted], dim=1)
+        return features
+
+    def required_fitting(self, model: str = "this model") -> Fitting:
+        """The fitting, or an error that names how to get one."""
+        if self.fitting is None:
+            name = model if model != "this model" else "MODEL"
+            raise ValueError(
+                f"{model} cannot optimise scenes per image yet: derender whiten --model {name} IMAGES --out "
+                "NEW makes a copy that can"
+            )
+        return self.fitting
+
+    def with_steps(self, steps: int) -> "Features":
+        """The same with so many steps of fitting per image; 0: features are feed-forward only."""
+        if steps < 0:
+            raise ValueError(f"fit_steps must be 0 or more, got {steps}")
+        return replace(self, fitting=None if self.fitting is None else self.fitting.with_steps(steps))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors that ``save`` writes, by name."""
+        parts = (part for part in (self.whitening, self.fitting) if part is not None)
+        return {name: value for part in parts for name, value in part.named_buffers()}
+
+    def save(self, folder: Path) -> None:
+        """Write a file for each part there is into a saved model's folder."""
+        if self.whitening is not None:
+            self.whitening.save(folder / WHITENING_FILE)
+        if self.fitting is not None:
+            self.fitting.save(folder / FITTING_FILE)
+
+    @classmethod
+    def load(cls, folder: Path, image_size: int) -> "Features":
+        """Read the parts in a saved model's folder; damage or maps of another size are a ValueError."""
+        whitening, fitting = folder / WHITENING_FILE, folder / FITTING_FILE
+        return cls(
+            Whitening.load(whitening) if whitening.is_file() else None,
+            Fitting.load(fitting, image_size) if fitting.is_file() else None,
+        )
 
 
 class EmbeddingModel(nn.Module):

@@ -25,8 +25,7 @@ from derender.model import Derenderer
 from derender.networks.factors import Number
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_features import one_cycle
-from derender.postprocess.fitting import PARAMETERS, STEPS
-from derender.postprocess.morphable import MorphableMaps
+from derender.postprocess.fitting import PARAMETERS, STEPS, MorphableMaps
 from derender.scene import Scene, crop
 from derender.scene.perturb import PerturbSettings
 from derender.scene.scene import seen_in_mirror

@@ -21,8 +21,7 @@ from derender.model import Derenderer
 from derender.networks import Factor
 from derender.postprocess import Features
 from derender.postprocess.embedding import HISTOGRAMS
-from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings
-from derender.postprocess.morphable import MorphableMaps
+from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings, MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
 from derender.render import warp
 from derender.scene import Scene
