@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -225,10 +226,10 @@ def read_images(
         def kept() -> Iterator[np.ndarray]:
             """Decode everything, note it in ``found``, and yield the rows."""
             for chunk in chunks:
-                yield chunk.images[result.add(chunk)]
+                yield np.array([one.pixels for one in chunk if result.add(one)], np.uint8)
                 if progress is not None:
-                    done = chunk.start + len(chunk)
-                    progress(done, estimated_total(done, chunk.share, stream.limit))
+                    done = chunk[-1].number + 1
+                    progress(done, estimated_total(done, chunk[-1].share, stream.limit))
             if not result.files:
                 where, skipped = f"{stream.source} ({stream.layout})", result.skipped
                 first = f"the first is {skipped[0].file!r}: {skipped[0].reason}" if skipped else ""
@@ -238,8 +239,8 @@ def read_images(
         count = None if stream.table is None else len(stream.table.files)
         if cache is None and count is not None and count * 3 * image_size**2 <= memory_limit_bytes:
             images = np.empty((count, 3, image_size, image_size), np.uint8)
-            for rows in kept():
-                images[len(result.files) - len(rows) : len(result.files)] = rows
+            for row, pixels in enumerate(chain.from_iterable(kept())):
+                images[row] = pixels
             return _joined(stream, images[: len(result.files)], result.content())
         settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
         made_of = repr((settings, PIL.__version__, stream.identity()))
@@ -265,7 +266,7 @@ def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) 
 
 @dataclass
 class _Found:
-    """What is known after each chunk: names, labels and partitions of the rows, and what is left out."""
+    """What is known after each image: names, labels and partitions of the rows, and what is left out."""
 
     keep_duplicates: bool
     files: list[str] = field(default_factory=list)
@@ -276,27 +277,24 @@ class _Found:
     kinds: Kinds = field(default_factory=Kinds)
     seen: dict[bytes, str] = field(default_factory=dict)  # the first file of each digest
 
-    def add(self, chunk: Decoded) -> list[int]:
-        """Note a chunk; which of its rows are to be kept."""
-        kept = []
-        for row, (file, outcome) in enumerate(zip(chunk.files, chunk.outcomes, strict=True)):
-            if isinstance(outcome, Unreadable):
-                self.skipped.append(Skipped(file, str(outcome)))
-                continue
-            if (earlier := self.seen.get(outcome)) is None:
-                self.seen[outcome] = file
-            else:
-                self.copies.append(Duplicate(file, earlier))
-            if earlier is None or self.keep_duplicates:
-                kept.append(row)
-                self.kinds.see(chunk.labels[row])
-                for name in chunk.labels[row]:
-                    self.columns.setdefault(name, [None] * len(self.files))
-                for name, column in self.columns.items():
-                    column.append(chunk.labels[row].get(name))
-                self.files.append(file)
-                self.partitions.append(chunk.partitions[row])
-        return kept
+    def add(self, one: Decoded) -> bool:
+        """Note an image; whether it is to be kept."""
+        if isinstance(one.outcome, Unreadable):
+            self.skipped.append(Skipped(one.file, str(one.outcome)))
+            return False
+        if one.outcome in self.seen:
+            self.copies.append(Duplicate(one.file, self.seen[one.outcome]))
+            if not self.keep_duplicates:
+                return False
+        self.seen.setdefault(one.outcome, one.file)
+        self.kinds.see(one.labels)
+        for name in one.labels:
+            self.columns.setdefault(name, [None] * len(self.files))
+        for name, column in self.columns.items():
+            column.append(one.labels.get(name))
+        self.files.append(one.file)
+        self.partitions.append(one.partition)
+        return True
 
     def content(self) -> dict[str, Any]:
         """Everything, as JSON has it."""

@@ -8,12 +8,13 @@ import hashlib
 import os
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -118,20 +119,16 @@ CHUNK = 32  # images that one thread decodes before it hands them on
 DIGEST_BYTES = 16
 
 
-@dataclass(frozen=True)
-class Decoded:
-    """A few consecutive samples."""
+class Decoded(NamedTuple):
+    """A decoded sample."""
 
-    start: int  # the number of the first one in the stream
-    files: tuple[str, ...]  # their names
-    images: UInt8[np.ndarray, "n 3 s s"]  # (n, 3, S, S) RGB; rows of unreadable images are waste
-    outcomes: tuple[bytes | Unreadable, ...]  # the digest of the pixels, or why there are none
-    labels: tuple[Mapping[str, Value], ...]  # of each sample
-    partitions: tuple[str, ...]  # of each sample
+    number: int  # its place in the stream
+    file: str
+    pixels: UInt8[np.ndarray, "3 s s"] | None  # RGB; None: unreadable, or needed no more
+    outcome: bytes | Unreadable  # the digest of the pixels, or why there are none
+    labels: Mapping[str, Value]
+    partition: str
     share: float | None  # how much of the stream has been read, 0..1; None where that is unknown
-
-    def __len__(self) -> int:
-        return len(self.files)
 
 
 def usable_cores() -> int:
@@ -141,12 +138,12 @@ def usable_cores() -> int:
 
 def decoded(
     stream: Stream, image_size: int, *, fit: str = "crop", start: int = 0, workers: int | None = None
-) -> Generator[Decoded]:
-    """Decode a stream from sample ``start`` on, up to its limit; close it to end its threads. Wrap in
-    ``quiet_pillow``."""
+) -> Generator[list[Decoded]]:
+    """Decode a stream from sample ``start`` on, up to its limit, some at a time; close it to end its threads.
+    Wrap in ``quiet_pillow``."""
     cores = workers or usable_cores()
     samples = islice(stream.samples(start), None if stream.limit is None else max(0, stream.limit - start))
-    waiting: deque[Future[Decoded]] = deque()
+    waiting: deque[Future[list[Decoded]]] = deque()
     pool = ThreadPoolExecutor(cores, thread_name_prefix="decode")
     try:
         while chunk := list(islice(samples, CHUNK)):
@@ -160,27 +157,27 @@ def decoded(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def decode_samples(start: int, samples: Sequence[Sample], image_size: int, fit: str = "crop") -> Decoded:
-    """Decode consecutive samples, at least one, the first of them number ``start``, in this thread."""
-    images = np.empty((len(samples), 3, image_size, image_size), np.uint8)
-    outcomes = tuple(_decode_one(target, sample, fit) for target, sample in zip(images, samples, strict=True))
-    files, labels, parts = zip(*((one.file, one.labels, one.partition) for one in samples), strict=True)
-    return Decoded(start, files, images, outcomes, labels, parts, samples[-1].share)
-
-
-def _decode_one(target: np.ndarray, sample: Sample, fit: str) -> bytes | Unreadable:
-    """Decode one sample into its row and digest its pixels, or say why that cannot be done."""
-    try:
-        with one_large_image_at_a_time if sample.size() > LARGE_BYTES else nullcontext():
-            if not (encoded := sample.read()):
-                return Unreadable("empty file")
-            target[:] = decode(encoded, target.shape[-1], sample.fit if fit == "crop" else fit, sample.box)
-            del encoded
-    except ValueError as problem:
-        return Unreadable(str(problem))
-    except OSError as problem:
-        return Unreadable(f"cannot be read: {problem.strerror or problem}")
-    return hashlib.blake2b(target.data, digest_size=DIGEST_BYTES).digest()
+def decode_samples(
+    start: int, samples: Iterable[Sample], image_size: int, fit: str = "crop"
+) -> list[Decoded]:
+    """Decode consecutive samples, the first of them number ``start``, in this thread."""
+    result = []
+    for number, sample in enumerate(samples, start):
+        pixels = None
+        try:
+            with one_large_image_at_a_time if sample.size() > LARGE_BYTES else nullcontext():
+                if not (encoded := sample.read()):
+                    raise Unreadable("empty file")
+                pixels = decode(encoded, image_size, sample.fit if fit == "crop" else fit, sample.box)
+                del encoded
+            outcome = hashlib.blake2b(pixels.data, digest_size=DIGEST_BYTES).digest()
+        except ValueError as problem:
+            outcome = Unreadable(str(problem))
+        except OSError as problem:
+            outcome = Unreadable(f"cannot be read: {problem.strerror or problem}")
+        known = sample.labels, sample.partition, sample.share
+        result.append(Decoded(number, sample.file, pixels, outcome, *known))
+    return result
 
 
 def estimated_total(done: int, share: float | None, limit: int | None) -> int:

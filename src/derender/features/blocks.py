@@ -15,10 +15,9 @@ import pickle
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
-from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +48,15 @@ from derender.storage.places import optional
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]
 """Opens the stream anew, in whatever process."""
-Block = tuple[Decoded, Mapping[str, np.ndarray]]
+Block = tuple[list[Decoded], Mapping[str, np.ndarray]]
 """Consecutive samples without their pixels, and the features by factor of those that could be read."""
 
 
-def embedded_block(model: Any, chunk: Decoded) -> Block:
+def embedded_block(model: Any, chunk: Sequence[Decoded]) -> Block:
     """The features of decoded samples; the model is in evaluation mode."""
-    good = [row for row, outcome in enumerate(chunk.outcomes) if isinstance(outcome, bytes)]
-    codes = factor_codes(model, as_batch(chunk.images[good], model.device)) if good else {}
-    return replace(chunk, images=chunk.images[:0]), codes
+    good = [one.pixels for one in chunk if one.pixels is not None]
+    codes = factor_codes(model, as_batch(np.stack(good), model.device)) if good else {}
+    return [one._replace(pixels=None) for one in chunk], codes
 
 
 @contextmanager
@@ -68,32 +67,15 @@ def local_blocks(
     """The blocks from sample ``start`` on, computed in this process while a pool decodes ahead."""
     with quiet_pillow(), evaluating(model), ExitStack() as stack:
         if isinstance(source, ImageSet):
-            chunks = _of_set(source, start, batch_size)
+            pairs = enumerate(zip(source.files, source.images, strict=True))
+            samples = (
+                Decoded(row, file, pixels, b"", {}, "", (row + 1) / len(source))
+                for row, (file, pixels) in islice(pairs, start, None)
+            )
         else:
             pixels = decoded(source, model.image_size, fit=fit, start=start, workers=workers)
-            chunks = _regrouped(stack.enter_context(closing(pixels)), batch_size)
-        yield (embedded_block(model, chunk) for chunk in chunks)
-
-
-def _of_set(images: ImageSet, start: int, size: int) -> Iterator[Decoded]:
-    for first in range(start, len(images), size):
-        files, pixels = images.files[first : first + size], np.array(images.images[first : first + size])
-        n, share = len(files), (first + len(files)) / len(images)
-        yield Decoded(first, files, pixels, (b"",) * n, ({},) * n, ("",) * n, share)
-
-
-def _regrouped(chunks: Iterable[Decoded], size: int) -> Iterator[Decoded]:
-    """The same samples, ``size`` at a time."""
-    rows = (
-        (chunk.start + row, one[0], one[1], one[2], one[3], one[4], chunk.share)
-        for chunk in chunks
-        for row, one in enumerate(
-            zip(chunk.files, chunk.images, chunk.outcomes, chunk.labels, chunk.partitions, strict=True)
-        )
-    )
-    while group := list(islice(rows, size)):
-        numbers, files, images, outcomes, labels, partitions, shares = zip(*group, strict=True)
-        yield Decoded(numbers[0], files, np.stack(images), outcomes, labels, partitions, shares[-1])
+            samples = chain.from_iterable(stack.enter_context(closing(pixels)))
+        yield (embedded_block(model, batch) for batch in iter(lambda: list(islice(samples, batch_size)), []))
 
 
 class BlockEmbedder:
@@ -190,33 +172,30 @@ def rows_of(block: Block, seen: set[bytes], keep_duplicates: bool = False) -> Ro
     ``seen`` holds the digests of the images before, and grows. A feature that is not finite is an error.
     """
     chunk, codes = block
-    digests, kept, copies, skipped = [], [], 0, []
-    for row, outcome in enumerate(chunk.outcomes):
-        if isinstance(outcome, Unreadable):
-            skipped.append((chunk.files[row], str(outcome)))
+    kept: dict[int, Decoded] = {}  # by their place among the images that could be read
+    copies, skipped = 0, []
+    for place, one in enumerate(chunk):
+        if isinstance(one.outcome, Unreadable):
+            skipped.append((one.file, str(one.outcome)))
             continue
-        copy = outcome in seen and outcome != b""  # copies are dropped from a set when it is read
+        copy = one.outcome in seen and one.outcome != b""  # copies are dropped from a set when it is read
         if keep_duplicates or not copy:
-            kept.append((row, len(digests)))
+            kept[place - len(skipped)] = one
         copies += copy
-        digests.append(outcome)
-        seen.add(outcome)
-    rows, places = [row for row, _ in kept], [place for _, place in kept]
-    files = [chunk.files[row] for row in rows]
-    factors = {name: values[places] for name, values in codes.items()} if rows else {}
+        seen.add(one.outcome)
+    rows = kept.values()
+    files = [one.file for one in rows]
+    factors = {name: values[list(kept)] for name, values in codes.items()} if kept else {}
     check_finite(factors, files)
-    labels = [
-        ({"partition": chunk.partitions[row]} if chunk.partitions[row] else {}) | dict(chunk.labels[row])
-        for row in rows
-    ]
+    labels = [({"partition": one.partition} if one.partition else {}) | dict(one.labels) for one in rows]
     columns = {
         "file": pa.array(files, pa.string()),
-        "position": pa.array([chunk.start + row for row in rows], pa.int64()),
-        "digest": pa.array([digests[place] for place in places], pa.binary()),
+        "position": pa.array([one.number for one in rows], pa.int64()),
+        "digest": pa.array([one.outcome for one in rows], pa.binary()),
         "labels": pa.array([json.dumps(one, ensure_ascii=False) for one in labels], pa.string()),
         **{f"factor {name}": factor_column(values) for name, values in factors.items()},
     }
-    return pa.table(columns), {"following": chunk.start + len(chunk), "skipped": skipped, "copies": copies}
+    return pa.table(columns), {"following": chunk[-1].number + 1, "skipped": skipped, "copies": copies}
 
 
 class Parts:

@@ -218,8 +218,8 @@ def _compute(
                     if sum(len(table) for table, _ in waiting) >= PART_ROWS:
                         write()
                     if progress is not None:
-                        done = block[0].start + len(block[0])
-                        progress(done, estimated_total(done, block[0].share, limit))
+                        done, share = block[0][-1].number + 1, block[0][-1].share
+                        progress(done, estimated_total(done, share, limit))
             finally:
                 write()
     except BaseException as stopped:
