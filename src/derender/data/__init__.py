@@ -3,7 +3,7 @@
 opening       from what the user wrote to a stream of images: open_images; zip archives
 source        named files; parquet files, their sizes checked before they are read
 layouts/      how data sets lie: recognised, and read into a table of files and labels
-stream        images one after another, decoded on every core; shards (WebDataset), huggingface
+stream        images one after another, decoded on every core; streamed: WebDataset, Hugging Face
 image         decode one; images as a caller has them
 image_set     a stream collected into an array: read_images; its split; cache: large sets in a memory map
 maps          images with masks, with exact depth, normals and albedo
@@ -33,7 +33,7 @@ from derender.data.image_set import (
     split_indices,
 )
 from derender.data.layouts import LAYOUTS
-from derender.data.layouts.celeba import MASK_CLASSES
+from derender.data.layouts.faces import MASK_CLASSES
 from derender.data.layouts.layout import HALVES, half_of, missing
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source

@@ -53,11 +53,15 @@ def read_cache(
                 return None
             stream.seek(end - length)
             note = json.loads(stream.read(length))
-        result, checksum, content = note["fingerprint"], note["checksum"], note["content"]
+        checksum, content = note["checksum"], note["content"]
         count = len(content["files"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
-    if result != fingerprint or end - length != count * 3 * image_size * image_size or not count:
+    if (
+        note.get("fingerprint") != fingerprint
+        or end - length != count * 3 * image_size * image_size
+        or not count
+    ):
         return None
     images = np.memmap(file, np.uint8, mode="c", shape=(count, 3, image_size, image_size))
     return (images, content) if sample_checksum(images) == checksum else None
@@ -70,14 +74,9 @@ def write_cache(
     chunks: Iterator[np.ndarray],
     known: Callable[[], dict[str, Any]],
 ) -> None:
-    """Make the file anew; one that cannot be written is an OSError that says what to do.
+    """Make the file anew of rows in ``chunks``, (n, 3, S, S) uint8; an OSError says what to do.
 
-    Args:
-        file: where.
-        fingerprint: of what the rows are made from.
-        image_size: side of the images in pixels.
-        chunks: rows, (n, 3, S, S) uint8.
-        known: gives what is known of them after the last; its "files" name the rows.
+    ``known`` gives, after the last, what is known of the rows; its "files" name them.
     """
     written, storing = 0, True
     try:

@@ -23,7 +23,7 @@ from PIL import Image
 from derender.data.image import DECODER_ERRORS, fit_square, quiet_pillow, upright_size
 from derender.data.image_set import ImageSet, read_images
 from derender.data.layouts import layout_named
-from derender.data.layouts.celeba import MASK_CLASSES, parts_of
+from derender.data.layouts.faces import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
 from derender.data.opening import list_images, open_source, parse_source

@@ -27,12 +27,10 @@ from urllib.parse import parse_qsl
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.huggingface import HuggingFaceStream, is_saved
 from derender.data.image import HEAD_BYTES, LARGE_BYTES, Unreadable, refuse_by_header
 from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
-from derender.data.shards import SHARD_SUFFIXES, ShardStream, find_shards
 from derender.data.source import (
     FILE_LIMIT_BYTES,
     FileSource,
@@ -44,6 +42,7 @@ from derender.data.source import (
     is_image,
 )
 from derender.data.stream import Sample, Stream
+from derender.data.streamed import SHARD_SUFFIXES, HuggingFaceStream, ShardStream, find_shards, is_saved
 from derender.storage.places import SUFFIXES, nearest_sibling, require_known
 
 _HEADER_BYTES = 30

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from derender.data import read_image, read_images
-from derender.data.shards import expand_braces, find_shards
+from derender.data.streamed import expand_braces, find_shards
 
 
 @pytest.fixture(autouse=True)

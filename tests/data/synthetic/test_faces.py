@@ -7,7 +7,7 @@ import pytest
 import torch
 from tests.data.synthetic.test_generated import inner
 
-from derender.data.layouts.celeba import MASK_CLASSES
+from derender.data.layouts.faces import MASK_CLASSES
 from derender.data.synthetic import VIEWS, FaceSettings, LightSettings, ViewSettings, faces
 from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.render import render

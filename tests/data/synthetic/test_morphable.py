@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from derender.data.layouts.celeba import MASK_CLASSES
+from derender.data.layouts.faces import MASK_CLASSES
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, MorphableFaces, faces
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -1,9 +1,8 @@
 """Whether a set of images suits the method, before anyone trains: ``doctor``.
 
-measures has what is measured; one finding for each of them and a verdict are made here, by the thresholds in
-``checks.yaml``. Limits were chosen on one half of the material of lab/doctor.md and checked on the other. Of
-distinct, unreadable, small, oblong, grey and clipped images they are conventions: nothing was measured to set
-them.
+Each of the measures (measures.py) becomes a finding by the limits in ``checks.yaml``, all of them a verdict.
+Limits were chosen on one half of the material of lab/doctor.md and checked on the other; those on distinct,
+unreadable, small, oblong, grey and clipped images are conventions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -87,8 +86,8 @@ def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:
     An objection needs certainty: a value past ``objects`` by less than two errors is only trouble.
     """
     sign = 1 if check.noted is None else -1  # so that more is better
-    limits = (None if limit is None else sign * limit for limit in (check.objects, check.struggles))
-    (objects, struggles), middle, margin = limits, sign * value.value, 2 * value.error
+    objects, struggles = (None if one is None else sign * one for one in (check.objects, check.struggles))
+    middle, margin = sign * value.value, 2 * value.error
     if objects is not None and middle < objects:
         return ("objection", True) if middle + margin < objects else ("trouble", False)
     if struggles is not None and middle < struggles:
@@ -104,28 +103,26 @@ def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFi
     check = CHECKS[name]
     level, certain = judged(value, check)
     is_share = check.noted is not None
-    number = format(value.value, ",.0f" if value.value >= 1000 else ",.3g")
-    number = percent(value.value) if is_share else number
+    plain = format(value.value, ",.0f" if value.value >= 1000 else ",.3g")
+    number = percent(value.value) if is_share else plain
     in_order = value.value == 0 if is_share else level == "good"
     clause = (check.good if in_order else check.bad).format(number=number)
     measured = [] if "{number}" in check.bad else [f"{check.label} {number}"]
     if value.error:
         measured.append(f"± {percent(2 * value.error) if is_share else format(2 * value.error, '.2g')}")
-    details = (" ".join(measured), "" if certain else "too few images to be sure", detail)
-    brackets = "; ".join(filter(None, details))
+    unsure = "" if certain else "too few images to be sure"
+    brackets = "; ".join(filter(None, (" ".join(measured), unsure, detail)))
     text = f"{clause[:1].upper()}{clause[1:]}{f' ({brackets})' if brackets else ''}."
-    if level == "good":
-        return CheckFinding(check.name, level, text, value=value)
-    return CheckFinding(check.name, level, text, check.advice, "" if level == "note" else clause, value)
+    advice, reason = ("" if level == "good" else check.advice), "" if level in ("good", "note") else clause
+    return CheckFinding(check.name, level, text, advice, reason, value)
 
 
 def findings_of(
     values: Mapping[str, JackknifeEstimate], details: Mapping[str, str], axis: measures.SymmetryAxis | None
 ) -> tuple[CheckFinding, ...]:
     """A finding for every value; without an axis nothing was compared, and the rest stays open."""
-    result = {
-        name: finding_of(name, values[name], details.get(name, "")) for name in CHECKS if name in values
-    }
+    known = [name for name in CHECKS if name in values]
+    result = {name: finding_of(name, values[name], details.get(name, "")) for name in known}
     if axis is None:
         text = "Alignment, kinds, symmetry and variety were not measured: too few distinct images."
         return (*result.values(), CheckFinding("the rest", "open", text))
@@ -137,19 +134,16 @@ def findings_of(
         result["kinship"] = CheckFinding("kinds", "open", "No two groups are large enough to compare.")
     off = result["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
     name = "symmetry" if off else "fill"
-    if abs(axis.offset) >= AXIS_OFFSET and (off or result[name].level == "good"):
+    one = result[name]
+    if abs(axis.offset) >= AXIS_OFFSET and (off or one.level == "good"):
         side = "right" if axis.offset > 0 else "left"
         where = f"Their axis of symmetry lies {percent(abs(axis.offset))} of the width {side} of the middle."
-        result[name] = replace(
-            result[name],
-            level=result[name].level if off else "trouble",
-            text=f"{result[name].text} {where}",
-            advice=f"Crop further to the {side}, so that the axis is in the middle.",
-            short="the axis of symmetry is off the middle",
-        )
+        advice = f"Crop further to the {side}, so that the axis is in the middle."
+        level, short = (one.level if off else "trouble"), "the axis of symmetry is off the middle"
+        result[name] = replace(one, level=level, text=f"{one.text} {where}", advice=advice, short=short)
     if result["light"].level == "objection":  # where both are missing, nothing is left to learn a shape from
-        view = values["view"]
-        missing = view.value + 2 * view.error < (CHECKS["view"].struggles or 0)
+        view = values["view"].value + 2 * values["view"].error
+        missing = view < (CHECKS["view"].struggles or 0)
         name, level = ("view", "objection") if missing else ("light", "trouble")
         result[name] = replace(result[name], level=level)
     return tuple(result.values())
@@ -241,15 +235,14 @@ def doctor(
     Args:
         images: a folder, zip, shards or data set as ``read_images`` takes it. Or a set that was read with
             ``keep_duplicates=True`` at a multiple of 32 pixels.
-        dataset: the layout's name, or "auto" to recognise it.
-        limit: examine at most so many images.
+        dataset, limit: as of ``read_images``.
         seed: of the random splits in two groups; the same images and seed give the same examination.
         progress: called with (done, total), first of reading, then of examining.
     """
     originals = None
     if not isinstance(images, ImageSet):
         source = images
-        if isinstance(source, str | Path) and Path(source).is_file() and is_image(str(source)):
+        if Path(source).is_file() and is_image(str(source)):
             raise ValueError(f"{source} is one image: a set is examined as a whole, give its folder or zip")
         how = {"dataset": dataset, "limit": limit, "keep_duplicates": True, "progress": progress}
         images = read_images(source, EXAMINED_PX, **how)

@@ -12,6 +12,7 @@ above or below, views that differ by tilt alone, and more than two kinds of thin
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from derender.data.image import DECODER_ERRORS, quiet_pillow, upright_size
 from derender.data.source import Source, evenly_spaced
 
 GREY_PX, TINY_PX = 32, 16
-"""Sides of the grey images that structure is measured on, and that near copies are found by."""
+"""Sides of the grey images that structure is measured on, and that near copies are detected in."""
 
 DARK, BRIGHT = 2, 253  # at or beyond these values of 255 a channel counts as clipped
 COPY_CORRELATION = 0.98  # tiny grey images that correlate by this much or more are near copies
@@ -121,10 +122,9 @@ def _averaged(grey: Float32[np.ndarray, "n h w"], side: int) -> Float32[np.ndarr
 def near_copy_groups(tiny: Float32[np.ndarray, "n d"]) -> Int64[np.ndarray, " n"]:
     """For each image the first image of its group; itself where it has no earlier near copy.
 
-    Two images are near copies if their tiny grey versions (rows of length 1, or 0: blank images, which are
-    copies of one another) correlate by ``COPY_CORRELATION`` or more: shifted by a pixel or two, brightened,
-    compressed again. Candidates come from a k-d tree over the leading principal components, in which no two
-    near copies can be farther apart than in full. Groups are connected pairs: chains count as one. Leaves out
+    Two images are near copies if their tiny grey versions (rows of length 1; of 0 for blank images, copies of
+    one another) correlate by ``COPY_CORRELATION`` or more. Candidates come from a k-d tree over the leading
+    principal components, in which none are farther apart than in full. Groups are connected pairs. Leaves out
     colour, mirrored copies, and copies cropped otherwise.
     """
     group = np.arange(len(tiny))
@@ -164,10 +164,8 @@ def measure_originals(source: Source, files: tuple[str, ...], image_size: int) -
     sizes = []
     with quiet_pillow():
         for row in evenly_spaced(len(files), 1_000):
-            try:
+            with suppress(*DECODER_ERRORS):
                 sizes.append(sorted(upright_size(source.read(files[row]))))
-            except DECODER_ERRORS:
-                continue
     if not sizes:
         return None
     short, long = np.array(sizes).T

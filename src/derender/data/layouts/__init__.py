@@ -8,7 +8,7 @@ of its images, of which there may be millions.
 from collections.abc import Callable
 from functools import cache
 
-from derender.data.layouts import celeba, faces, rendered, tables
+from derender.data.layouts import faces, rendered, tables
 from derender.data.layouts.layout import (
     PARTITION_NAMES,
     TOLD,
@@ -60,8 +60,8 @@ _READERS = {  # by name: whether a source looks like the layout, and the table o
     "synface_tracks": (rendered.is_tracks, rendered.load_tracks),
     "depth_pairs": (rendered.is_paired, rendered.load_pairs),
     "rafdb": (lambda source: faces.raf_list(source) is not None, faces.load_rafdb),
-    "celebamask": (celeba.is_celebamask, celeba.load_celebamask),
-    "celeba": (celeba.is_celeba, celeba.load_celeba),
+    "celebamask": (faces.is_celebamask, faces.load_celebamask),
+    "celeba": (faces.is_celeba, faces.load_celeba),
     "utkface": (lambda source: mostly(faces.UTK_NAME, map(base_name, source.images)), faces.load_utkface),
     "yaleb": (lambda source: mostly(faces.YALE_NAME, map(base_name, source.images)), faces.load_yale),
     "lfw": (lambda source: mostly(faces.LFW_NAME, source.images), faces.load_lfw),
