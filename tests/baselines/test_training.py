@@ -14,10 +14,10 @@ from tests.baselines.conftest import OWN, config, generator_of
 import derender
 from derender.baselines import load_baseline, network_type, read_any_config, train_baseline
 from derender.features import embed_image_set
+from derender.overrides import checked
 from derender.report.run import baseline_sheet, run_page
 from derender.training import resolve, train
 from derender.training.checkpoint import WEIGHTS_FILE
-from derender.training.config import config_from_tree
 from derender.training.run_folder import read_config, read_metrics
 
 
@@ -126,4 +126,4 @@ def test_a_run_of_one_kind_is_not_taken_for_another(runs, blobs):
         train(resolve("small", ["image_size=32", "perceptual=none"]), blobs, runs / "ae", resume=True)
     tree = vqvae().model_dump(mode="json")
     with pytest.raises(ValueError, match=r"unknown setting 'model\.widht'; did you mean 'model\.width'"):
-        config_from_tree({**tree, "model": {**tree["model"], "widht": 3}}, vqvae)
+        checked({**tree, "model": {**tree["model"], "widht": 3}}, vqvae)

@@ -7,14 +7,15 @@ import pytest
 import torch
 import yaml
 
-from derender.training.config import PRESETS, TrainConfig, config_from_tree, resolve, setting_names, to_yaml
+from derender.overrides import checked
+from derender.training.config import PRESETS, TrainConfig, resolve, setting_names, to_yaml
 from derender.training.derender_task import DerenderTask
 
 
 def test_every_preset_survives_yaml():
     for name, preset in PRESETS.items():
         assert preset.preset == name
-        assert config_from_tree(yaml.safe_load(to_yaml(preset))) == preset
+        assert checked(yaml.safe_load(to_yaml(preset)), TrainConfig) == preset
 
 
 def test_overrides_by_full_and_by_short_name():
@@ -57,7 +58,7 @@ def test_an_unknown_preset_names_the_nearest_and_an_unknown_key_in_a_file_is_ref
         resolve("face")
     tree = yaml.safe_load(to_yaml(PRESETS["small"]))
     with pytest.raises(ValueError, match=r"unknown setting 'objective.flip_wieght'"):
-        config_from_tree({**tree, "objective": {**tree["objective"], "flip_wieght": 1}})
+        checked({**tree, "objective": {**tree["objective"], "flip_wieght": 1}}, TrainConfig)
 
 
 def test_every_setting_has_a_name_that_resolves():

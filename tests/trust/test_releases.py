@@ -18,9 +18,10 @@ from derender.data import read_images
 from derender.data.cache import _MARK, read_cache
 from derender.features import FeatureTable, missing
 from derender.interpretation.probe import Probe, load_probe
+from derender.overrides import checked
 from derender.storage.places import CONFIG_FILE
 from derender.training.checkpoint import TrainState, load_checkpoint
-from derender.training.config import config_from_tree
+from derender.training.config import TrainConfig
 from derender.training.run_folder import read_config, read_config_tree, read_metrics
 
 RELEASES = Path(__file__).with_name("releases")
@@ -95,7 +96,7 @@ def test_its_checkpoint_goes_on(release):
 
 
 def test_the_configuration_and_metrics_of_its_run_are_read(release):
-    assert read_config(release / "run") == config_from_tree(expected(release, "config"))
+    assert read_config(release / "run") == checked(expected(release, "config"), TrainConfig)
     assert read_metrics(release / "run") == [{"kind": "train", "images": 640, "l1": 0.125}]
 
 

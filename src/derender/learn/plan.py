@@ -13,9 +13,10 @@ from pydantic import BeforeValidator, Field, StringConstraints
 
 from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
 from derender.features import named
+from derender.overrides import checked
 from derender.settings import Settings
 from derender.storage.bounded import YAML_LIMIT, parse_yaml, read_text
-from derender.training.config import as_overrides, config_from_tree, resolve
+from derender.training.config import as_overrides, resolve
 
 OURS = "derender"
 KINDS = {kind: kind for kind in (OURS, *BASELINES)} | {"ours": OURS}
@@ -137,7 +138,7 @@ def read_plan(path: str | Path) -> Plan:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as a plan: {error}") from error
     try:
-        plan = config_from_tree(tree, Plan)
+        plan = checked(tree, Plan)
         for fault in _faults(plan):
             raise ValueError(fault)
     except ValueError as error:

@@ -1,7 +1,7 @@
 """Checkpoints: weights, optimiser and counters, in files that hold no code.
 
 A checkpoint is a folder of files with checksums. It is written beside the old one, read back, and then takes
-its place. So a run killed at any moment leaves a whole checkpoint behind; the last but one is kept, too.
+its place: a kill at any moment leaves a whole one behind. The last but one is kept, too.
 """
 
 import json
@@ -95,7 +95,7 @@ def resume_from(
     """Load the last checkpoint of a run, or the one before it where the last is damaged or gone.
 
     Gives the counters (without any checkpoint zeros), and a sentence, also a warning, where it was not last.
-    A ValueError: both are damaged, or they are of another model.
+    Errors are those of `load_checkpoint`.
     """
     if not last.exists() and not previous.exists():
         return TrainState(), None

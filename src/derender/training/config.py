@@ -17,7 +17,7 @@ from derender.data import suggestion
 from derender.model import load
 from derender.networks import Factor
 from derender.networks.factors import GEOMETRY_START
-from derender.overrides import SHORT, checked, settings_by_name, with_changes
+from derender.overrides import SHORT, settings_by_name, with_changes
 from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
@@ -225,11 +225,6 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
             )
     loocc_factors(config.objective.loocc, renderer_named(config.model.renderer).all_factors)
     return config
-
-
-def config_from_tree(tree: Mapping[str, Any], kind: type[Any] = TrainConfig) -> Any:
-    """Check plain values (from YAML or JSON) and give the configuration, or one clear error."""
-    return checked(tree, kind)
 
 
 def to_yaml(config: Settings) -> str:

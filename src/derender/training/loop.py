@@ -22,25 +22,10 @@ from torch import Generator, Tensor
 from derender.data import ImageSet, split_indices
 from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.storage.folder import SplitRecord, write_split
-from derender.training import run_folder
+from derender.training import checkpoint, process, run_folder
 from derender.training.batches import Reader, batches_of, random_stream
-from derender.training.checkpoint import (
-    DamagedCheckpoint,
-    TrainState,
-    load_checkpoint,
-    resume_from,
-    save_checkpoint,
-)
 from derender.training.cuda_graph import Replayed
 from derender.training.distributed import open_fabric, ranks_of
-from derender.training.process import (
-    TrainingInterrupted,
-    deterministic_algorithms,
-    evaluating,
-    freed_memory_kept,
-    locked,
-    stop_on_signal,
-)
 from derender.training.task import (
     Progress,
     StepLosses,
@@ -70,9 +55,9 @@ SampleSheet = Callable[[Any, Tensor], Image.Image]
 def train_task(task: TrainingTask, images: ImageSet, out: str | Path, **how: Any) -> TrainResult:
     """Train any task; arguments, files and errors are those of `derender.training.train`."""
     images.require(10)
-    with deterministic_algorithms(task.config.deterministic), locked(Path(out)):
+    with process.deterministic_algorithms(task.config.deterministic), process.locked(Path(out)):
         run = _Run(task, images, Path(out), **how)
-        with freed_memory_kept() if run.fabric.device.type == "cpu" else nullcontext():
+        with process.freed_memory_kept() if run.fabric.device.type == "cpu" else nullcontext():
             return run.go_on()
 
 
@@ -114,9 +99,10 @@ class _Run:
         held_out = split.validation[:MAX_VALIDATION_IMAGES]
         self.held_rows = torch.from_numpy(held_out)
         self.held_out = torch.from_numpy(np.ascontiguousarray(images.images[held_out])).to(fabric.device)
-        self.state, note = TrainState(), None
+        self.state, note = checkpoint.TrainState(), None
         if resume:
-            self.state, note = resume_from(self.folder.last, self.folder.previous, self.model, self.optimiser)
+            both = self.folder.last, self.folder.previous
+            self.state, note = checkpoint.resume_from(*both, self.model, self.optimiser)
         self.fell_back = note is not None  # the damaged checkpoint is not to become the previous one
         self.watcher = task.watch(self.state.watcher) if config.watch else None
         self.validation: dict[str, float] = {}
@@ -145,7 +131,7 @@ class _Run:
         config, state = self.config, self.state
         began, images_before, seconds_before = time.perf_counter(), state.images, state.seconds
         stopped, steps = self.why_stop(), 0
-        with stop_on_signal() as signals:
+        with process.stop_on_signal() as signals:
             while stopped is None:
                 before = state.images
                 result = self.step()
@@ -180,7 +166,7 @@ class _Run:
                     self.checkpoint()
                 if interrupted and stopped is None:
                     self.close()
-                    raise TrainingInterrupted(
+                    raise process.TrainingInterrupted(
                         f"stopped after {state.images:,} images and saved; the same with --resume continues"
                     )
         if stopped == "collapse":
@@ -278,7 +264,7 @@ class _Run:
             return
         state.best_loss, state.validations_since_best = loss, 0
         if self.ranks.first:
-            save_checkpoint(self.folder.best, self.model, self.optimiser, state)
+            checkpoint.save_checkpoint(self.folder.best, self.model, self.optimiser, state)
             if self.config.keep == "best":
                 self.save_model(state.images)
 
@@ -288,7 +274,7 @@ class _Run:
         sums: dict[str, float] = defaultdict(float)
         seen, size = 0, self.config.batch_size
         batches = zip(self.held_out.split(size), self.held_rows.split(size), strict=True)
-        with evaluating(self.module):
+        with process.evaluating(self.module):
             for position, (batch, rows) in enumerate(batches):
                 if len(batch) < 2 and seen:
                     break
@@ -305,7 +291,7 @@ class _Run:
         """Write a sheet of decomposed held-out images."""
         if self.sample_sheet is None or not len(self.held_out) or not self.ranks.first:
             return
-        with evaluating(self.model), torch.no_grad():
+        with process.evaluating(self.model), torch.no_grad():
             sheet = self.sample_sheet(self.model, self.held_out[:SAMPLE_COUNT].float() / 255)
         with atomic_file(self.folder.samples / f"{self.state.images:09d}.png") as temporary:
             sheet.save(temporary, format="PNG")
@@ -315,8 +301,8 @@ class _Run:
         if not self.ranks.first:
             return
         self.state.watcher = self.watcher.memory() if self.watcher is not None else {}
-        previous = None if self.fell_back else self.folder.previous
-        save_checkpoint(self.folder.last, self.model, self.optimiser, self.state, previous=previous)
+        last, previous = self.folder.last, None if self.fell_back else self.folder.previous
+        checkpoint.save_checkpoint(last, self.model, self.optimiser, self.state, previous=previous)
         self.fell_back = False
         if self.config.keep == "last" or not self.folder.model.exists():
             self.save_model(self.state.images)
@@ -328,8 +314,8 @@ class _Run:
                 self.save_model(self.state.images)
         elif self.model_images is None:
             try:
-                best = load_checkpoint(self.folder.best, self.model, None)
-            except (DamagedCheckpoint, FileNotFoundError):
+                best = checkpoint.load_checkpoint(self.folder.best, self.model, None)
+            except (checkpoint.DamagedCheckpoint, FileNotFoundError):
                 note = f"{self.folder.best} is damaged or missing: {self.folder.model} stays as it is"
                 warnings.warn(note, DamageNoticed, stacklevel=2)
             else:

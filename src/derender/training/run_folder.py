@@ -16,6 +16,7 @@ from pydantic import ConfigDict, Field, FiniteFloat
 from typing_extensions import TypedDict
 
 from derender.data import ImageSet, Split
+from derender.overrides import checked, settings_by_name
 from derender.settings import Settings
 from derender.storage.atomic import remove_abandoned, write_whole
 from derender.storage.bounded import (
@@ -27,7 +28,7 @@ from derender.storage.bounded import (
     read_text,
 )
 from derender.training.checkpoint import read_state
-from derender.training.config import TrainConfig, config_from_tree, settings_by_name, to_yaml, without_removed
+from derender.training.config import TrainConfig, to_yaml, without_removed
 from derender.training.process import LOCK_FILE
 
 FORMAT = 1
@@ -115,7 +116,7 @@ def read_config(path: Path, kind: type[Any] = TrainConfig) -> Any:
     if trained != name:
         names = [f"the baseline {one}" if one else "a derender model" for one in (trained, name)]
         raise ValueError(f"{path} is a run of {names[0]}, not of {names[1]}: give another run folder")
-    return config_from_tree(tree, kind)
+    return checked(tree, kind)
 
 
 def read_config_tree(path: Path) -> dict[str, Any]:

@@ -1,8 +1,7 @@
 """The losses of one training step: decompose, render the scene and its flipped twin, compare; then LOOCC.
 
-Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). The twin reuses the decoded
-maps, and perturbed scenes are rendered in the same call. Several devices may share a batch (distributed.py),
-and it may be computed in chunks: the losses stay its own.
+Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). Several devices may share a
+batch (distributed.py), and it may be computed in chunks: the losses stay its own.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -33,9 +32,8 @@ Columns = Mapping[str, Shaped[Tensor, "n ..."]]
 class StepResult(StepLosses):
     """Losses of one batch, and the values that the watcher looks at.
 
-    ``terms`` are every weighted term of the total by name, and the plain masked L1 ("l1"), detached.
-    ``scene`` and ``rendering`` are without the twins. ``codes``, by factor, have gradient, for an objective
-    beside this one.
+    ``terms`` are every weighted term of the total and the plain masked L1 ("l1"). ``scene`` and ``rendering``
+    are without the twins. ``codes``, by factor, have gradient, for an objective beside this one.
     """
 
     scene: Scene
@@ -73,17 +71,15 @@ def training_step(
     def encode(rows: Columns) -> dict[str, Tensor]:
         return model.encode(rows["images"])
 
+    def confidence(rows: Columns) -> dict[str, Tensor]:
+        return vars(model.confidence(rows["images"]))
+
     with precision():
         codes = in_chunks(encode, {"images": images}, chunks)
         shared = share_codes(codes, [f.name for f in model.factors if f.mirrored], own, ranks)
-        scene = Scene.from_parameters(
-            in_chunks(lambda rows: dict(model.decode(dict(rows)).parameters), shared, chunks)
-        )
-        sigmas: dict[str, Tensor] = {}
-        if objective.confidence:
-            sigmas = in_chunks(
-                lambda rows: vars(model.confidence(rows["images"])), {"images": images}, chunks
-            )
+        values = in_chunks(lambda rows: model.decode(dict(rows)).parameters, shared, chunks)
+        sigmas = in_chunks(confidence, {"images": images}, chunks) if objective.confidence else {}
+        scene = Scene.from_parameters(values)
     scenes = [scene, model.mirror(scene)]
     left_out = None
     if objective.loocc != "none":
@@ -120,13 +116,9 @@ def training_step(
         seen = {"images": fill_uncovered(image[2 * count :], mask[2 * count :], images)}
         with precision():
             again = in_chunks(encode, seen, chunks)
-        contrast = loocc_loss(
-            {name: ranks.gather(code) for name, code in codes.items()},
-            {name: ranks.gather(code) for name, code in again.items()},
-            ranks.gather(left_out),
-            objective.loocc_temperature,
-            joint=objective.loocc_joint,
-        )
+        first, second = ({name: ranks.gather(code) for name, code in one.items()} for one in (codes, again))
+        changed, temperature = ranks.gather(left_out), objective.loocc_temperature
+        contrast = loocc_loss(first, second, changed, temperature, joint=objective.loocc_joint)
         terms["loocc"] = objective.loocc_weight * contrast
         if objective.cycle_weight > 0:
             terms["cycle"] = objective.cycle_weight * cycle_loss(model, again, scenes[2], objective)
@@ -143,8 +135,7 @@ def perturb_one_factor(
 ) -> tuple[Scene, Int[Tensor, " n"]]:
     """Change one factor of every scene, drawn per image; also which, as an index into ``model.factors``.
 
-    Ranks draw for all of the batch, as one process would. A ValueError: ``objective.loocc`` names no factor
-    of the model that can be perturbed.
+    Ranks draw for all of the batch, as one process would.
     """
     factors = loocc_factors(objective.loocc, model.factors)
     names = [factor.name for factor in model.factors]
@@ -178,8 +169,7 @@ def cycle_loss(
 ) -> Float[Tensor, ""]:  # fmt: skip
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
-    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors. The
-    rendered scene is a fixed, exact target for what an image alone leaves open (pitch above all).
+    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors.
     """
     total = rendered.depth.new_zeros(())
     for factor in loocc_factors(objective.loocc, model.factors):
@@ -194,8 +184,7 @@ def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: i
     """Apply a function of rows to ``inputs`` in chunks of rows, each computed again in backward.
 
     A row's output must not depend on other rows, as under batch norm. Source: gradient caching (Gao et al.
-    2021), through torch's activation checkpointing: losses and gradients of the batch for one more forward
-    pass.
+    2021), through torch's activation checkpointing.
     """
     if chunks == 1:
         return dict(function(inputs))
@@ -248,7 +237,5 @@ def _perceptual_terms(
     filled = torch.cat([torch.where(hole, images, columns[name]) for name in ("straight", "twin")])
     with precision():
         target, predicted = perceptual(images), perceptual(filled)
-    halves = {"perceptual": predicted[: len(images)], "perceptual_flip": predicted[len(images) :]}
-    return torch.stack(
-        [perceptual_loss(half, target, covered, columns.get(name)) for name, half in halves.items()]
-    )
+    halves = zip(("perceptual", "perceptual_flip"), predicted.split(len(images)), strict=True)
+    return torch.stack([perceptual_loss(half, target, covered, columns.get(name)) for name, half in halves])

@@ -1,7 +1,6 @@
 """What a run trains, as the loop sees it: a model, the losses of a batch, and a watcher.
 
-The loop decides on batches, learning rate, checkpoints and when to stop; everything else is the task's. A
-`Derenderer` is one task (derender_task.py), the trained baselines are others.
+The loop decides on batches, learning rate, checkpoints and when to stop; everything else is the task's.
 """
 
 from abc import ABC, abstractmethod

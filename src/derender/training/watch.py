@@ -1,12 +1,11 @@
 """Detects a training that fails while its loss still falls, and explains it in plain words.
 
-Unsupervised geometry can fail in ways that reconstruction does not show. Each sign below is a number measured
-on training batches, smoothed, and compared with a limit. A sign that stays on for a while is a finding. The
-limits were set on healthy and collapsed runs (lab/log.md), the times on runs with batches of 16: networks
-recover by updates, so larger batches get as many updates, not as many images.
+Each sign (signs.yaml) is a number measured on training batches, smoothed, and compared with a limit. A sign
+that stays on for a while is a finding. Limits were set on healthy and collapsed runs (lab/log.md), times on
+batches of 16: networks recover by updates, so larger batches get as many updates, not as many images.
 
-NaN and infinity are looked for at every stage: a NaN need not reach the loss, because a depth of NaN covers
-no pixel, and a pixel that nothing covers does not count.
+NaN and infinity are looked for at every stage: a depth of NaN covers no pixel, and so does not reach the
+loss.
 """
 
 import copy
@@ -46,7 +45,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Sign:
-    """One row of the table of signs: a measurement, its limit and its meaning."""
+    """A row of ``signs.yaml``: a measurement, its limit and its meaning."""
 
     name: str
     measure: str
@@ -127,9 +126,7 @@ class Watcher(FiniteWatch):
     def remembering(
         cls, ranges: SceneRanges, batch_size: int, memory: Mapping[str, Any], ranks: Ranks = ALONE
     ) -> "Watcher":
-        """A watcher that continues where ``memory`` was taken, or starts anew; a ValueError of what none
-        gave.
-        """
+        """A watcher that continues where ``memory`` was taken, or starts anew; else a ValueError."""
         try:
             watcher = cls(ranges, batch_size, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]

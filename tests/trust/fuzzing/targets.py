@@ -21,10 +21,11 @@ from derender.data import decode, open_source, opened_parquet, quiet_pillow, rea
 from derender.data.cache import read_cache
 from derender.evaluation.memory import Memory
 from derender.features import FeatureTable
+from derender.overrides import checked
 from derender.storage.atomic import CHECKSUMS
 from derender.training import resolve
 from derender.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
-from derender.training.config import config_from_tree, to_yaml
+from derender.training.config import TrainConfig, to_yaml
 from derender.training.run_folder import read_config_tree, read_metrics
 from derender.training.watch import Watcher
 
@@ -84,7 +85,7 @@ def configurations(place: Path) -> Iterator[Target]:
 
     def read(text: str) -> None:
         file.write_text(text, errors="surrogateescape")
-        config_from_tree(read_config_tree(place))
+        checked(read_config_tree(place), TrainConfig)
 
     documents = json_text(CONFIG.model_dump(mode="json")) | bytes_like(whole).map(TEXT)
     documents |= WORDS.map(lambda word: f"preset: {word}\n")
