@@ -1,12 +1,12 @@
 """A stream in blocks of consecutive images: embedded in order, here or on a cluster, and kept in parts.
 
-In this process a pool decodes ahead of the model. With Ray Data, blocks go to a pool of actors that each open
-the stream themselves; only features, names, labels and digests of pixels travel. Rows are the same bits.
+In this process a pool decodes ahead of the model. With Ray Data, actors each open the stream themselves; only
+features, names, labels and digests of pixels travel. Rows are the same bits.
 
-An unfinished table is a folder of parts, each written atomically, for a later run to resume. ``plan.json`` is
-what they are made of. A part holds some thousand rows, their positions and digests of pixels, and where to
-continue. The checksum of a part is in its name: one that is damaged or missing is made again, with those
-after it. Labels that came with a stream stay as JSON until their kinds are known, at the end.
+An unfinished table is a folder of parts, each written atomically, for a later run to resume, and a
+``plan.json`` of what they are made of. A part holds some thousand rows, their positions and digests of
+pixels, and where to continue. The checksum of a part is in its name: one that is damaged or missing is made
+again, with those after it. Labels of a stream stay as JSON until their kinds are known, at the end.
 """
 
 import json
@@ -46,8 +46,7 @@ from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measure
 from derender.storage.bounded import parse_json, read_json
 from derender.storage.places import optional
 
-OpenStream = Callable[[], AbstractContextManager[Stream]]
-"""Opens the stream anew, in whatever process."""
+OpenStream = Callable[[], AbstractContextManager[Stream]]  # opens the stream anew, in whatever process
 Block = tuple[list[Decoded], Mapping[str, np.ndarray]]
 """Consecutive samples without their pixels, and the features by factor of those that could be read."""
 
@@ -118,12 +117,8 @@ def ray_blocks(
 ) -> Iterator[Iterator[Block]]:  # fmt: skip
     """As ``local_blocks``, with ``workers`` actors of one core each, or of one GPU each for a model on one.
 
-    Ray starts an actor anew when its process or machine dies, and gives its block to another. Every machine
-    must be able to open the data under the same name. Without a cluster (``ray start``, RAY_ADDRESS) the
-    actors are processes on this machine. The stream's samples are counted first.
-
-    Raises:
-        ValueError: Ray is not installed.
+    Every machine must be able to open the data under the same name. Without a cluster (``ray start``,
+    RAY_ADDRESS) the actors are processes on this machine. A ValueError: Ray is not installed.
     """
     ray = optional("ray", "engine 'ray'", "ray")
     optional("ray.data", "engine 'ray'", "ray")
@@ -199,12 +194,8 @@ def rows_of(block: Block, seen: set[bytes], keep_duplicates: bool = False) -> Ro
 
 
 class Parts:
-    """A folder of parts.
-
-    Args:
-        folder: where; made if it is not there.
-        plan: what they are made of: anything JSON can hold.
-        fresh: delete parts of another plan; otherwise they are an error.
+    """A folder of parts, made of ``plan``, anything JSON can hold. Parts of another plan are an error, or go
+    if the table is ``fresh``.
 
     Attributes:
         following: the first sample that is in no part.
@@ -285,10 +276,7 @@ class Parts:
     def tables(
         self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None
     ) -> Iterator[FeatureTable]:
-        """The finished table, part by part, with its ``origin``.
-
-        ``known`` are labels of all images, where they were known beforehand; None: the stream's.
-        """
+        """The finished table, part by part; labels are the ``known`` ones of all images, or the stream's."""
         kinds = Kinds()
         for (texts,) in self._read("labels") if known is None else ():
             for text in texts.to_pylist():

@@ -1,8 +1,7 @@
 """From a model and any images to a feature table: in memory, or on disk and never whole in memory.
 
-On the way to a file, reading and decoding, computing, and writing overlap; the queues between them are
-bounded. Parts are written beside the table, in a folder of its name with ``.partial``, until all are there: a
-stopped run continues from them, and gives the same table, bit for bit: its batches are the same.
+On the way to a file parts are written beside it, in a folder of its name with ``.partial``, until all are
+there. A stopped run continues from them with the same batches, and gives the same table, bit for bit.
 """
 
 import hashlib
@@ -35,12 +34,9 @@ from derender.inputs import Progress, as_images, as_model
 from derender.storage.places import counted, model_folder, require_known
 from derender.training.held_out_errors import read_errors, reconstruction_percentile, unlike
 
-PART_ROWS = 4096
-"""A part is written when this many rows are there."""
-LISTED_SKIPPED = 20
-"""So many unreadable images are named; all are counted."""
-LOOKED_AT = 60
-"""Images that tell whether a model suits them."""
+PART_ROWS = 4096  # a part is written when this many rows are there
+LISTED_SKIPPED = 20  # so many unreadable images are named; all are counted
+LOOKED_AT = 60  # images that tell whether a model suits them
 ENGINES = ("local", "ray")
 
 
@@ -68,10 +64,9 @@ class Embedded:
     def describe(self) -> str:
         """One line: how many images of which data set, how many were left out or had been there."""
         parts = [f"{counted(self.rows, 'images')} from {self.source} ({self.layout})"]
-        parts += [f"{self.resumed:,} of them from the run before"] if self.resumed else []
-        parts += [f"{self.skipped:,} skipped"] if self.skipped else []
-        verb = "kept" if self.kept else "dropped"
-        parts += [f"{self.copies:,} identical copies {verb}"] if self.copies else []
+        verb, counts = "kept" if self.kept else "dropped", (self.resumed, self.skipped, self.copies)
+        texts = "of them from the run before", "skipped", f"identical copies {verb}"
+        parts += [f"{count:,} {text}" for count, text in zip(counts, texts, strict=True) if count]
         return ", ".join(parts)
 
 
@@ -123,11 +118,12 @@ def embed_to_file(
         ValueError: no image can be read, a feature is not finite, or the parts are of another run.
         KeyboardInterrupt: it was stopped; the message says what is kept.
     """
-    if Path(out).suffix.lower() not in ("", ".parquet"):
+    path = Path(out)
+    if path.suffix.lower() not in ("", ".parquet"):
         raise ValueError(
             f"{out}: a feature table is a parquet file, name it so (pandas.read_parquet reads it)"
         )
-    refuse_folder(Path(out))
+    refuse_folder(path)
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
     require_known("engine", engine, ENGINES)
@@ -148,7 +144,6 @@ def embed_to_file(
         assert isinstance(images, Stream | ImageSet)
         facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
         plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
-        path = Path(out)
         parts = Parts(path.with_name(f"{path.name}.partial"), plan, fresh=fresh)
         resumed, start = parts.rows, parts.following
         options = {"batch_size": batch_size, "fit": fit}
@@ -164,7 +159,7 @@ def embed_to_file(
 def unlike_training(images: ImageSet | str | Path, model: Any, **how: Any) -> str:
     """How a sample of images differs from a model's training; "" where it does not, or errors are unknown.
 
-    The line names a bundled model that fits better. ``how`` is as for `derender.inputs.as_images`.
+    The line names a bundled model that fits better; ``how`` as for `derender.inputs.as_images`.
     """
     net = as_model(model)
     known = None if net.source is None else read_errors(model_folder(net.source))

@@ -58,13 +58,9 @@ def evaluating(model: Any) -> Iterator[None]:
 
 
 def as_batch(images: np.ndarray, device: torch.device) -> Tensor:
-    """Images, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device; bytes travel as bytes.
-
-    Channels lie together in memory, which convolutions and normalisation are fastest with.
-    """
-    array = np.array(images)
-    tensor = torch.from_numpy(array).to(device)
-    batch = as_float(tensor) if array.dtype == np.uint8 else tensor.float()
+    """Images, uint8 or float in 0..1, as a float32 tensor of 0..1 on a device, channels last for speed."""
+    tensor = torch.from_numpy(np.array(images)).to(device)
+    batch = as_float(tensor) if tensor.dtype == torch.uint8 else tensor.float()
     return batch.contiguous(memory_format=torch.channels_last)
 
 
@@ -88,8 +84,7 @@ def embed_image_set(
     """Run a model's encoders over an image set of its size; labels and the owners' split go into the table.
 
     ``model`` has ``embed(images in 0..1) -> {factor: (N, D)}``, ``device`` and ``image_size``. Facts in
-    ``origin``, such as the model's path, win over those found here; ``progress`` is called with (images done,
-    images in all) after every batch.
+    ``origin``, such as the model's path, win over those found here.
     """
     check_size(model, images.images)
     factors = embed_images(model, images.images, batch_size=batch_size, progress=progress)

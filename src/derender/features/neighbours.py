@@ -32,8 +32,8 @@ SAME_FITTED = 0.3
 class Found:
     """The rows of a table nearest to an image (or the row of that name) by one factor, nearest first.
 
-    ``own_row`` is the row that ``like`` names, if any. ``same_image`` rows hold the very same image and are
-    left out unless copies are asked for. ``unchecked`` tables do not record which model made them.
+    ``own_row`` is the row that ``like`` names, if any. ``same_image`` rows hold the very same image.
+    ``unchecked`` tables do not record which model made them.
     """
 
     table: FeatureTable
@@ -125,8 +125,7 @@ def nearest(
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:  # fmt: skip
     """The ``k`` rows of a table nearest to a (D,) query by one factor, nearest first, and their distances.
 
-    Rows in ``exclude``, such as the query's own, are left out. ValueError: the factor or metric is unknown,
-    or the query does not fit.
+    Rows in ``exclude`` are left out. ValueError: unknown factor or metric, or the query does not fit.
     """
     rows = named(table.factors, factor, "factor")
     require_known("metric", metric, METRICS)
@@ -153,8 +152,7 @@ def nearest(
 def same_image(table: FeatureTable, codes: Mapping[str, np.ndarray]) -> Int64[np.ndarray, " m"]:
     """Rows of an image itself, or copies of it under other names: alike in every factor they share.
 
-    ``codes`` are (D,) features of the image by factor; factors that the table lacks are passed over. Rows are
-    in the table's order, none where image and table share no factor.
+    ``codes`` are (D,) features of the image by factor; factors that the table lacks are passed over.
     """
     shared = [name for name in codes if name in table.factors]
     fitted = PARAMETERS if table.origin.get("fit_steps") else ()

@@ -1,13 +1,12 @@
 """The file a FeatureTable lives in: parquet that any tool reads.
 
-Column ``file``, one list column of float32 per factor, then the label columns. Which column is which, and
-where the table came from, stands as JSON in the file's metadata. Files made elsewhere are read too: without
-our metadata the list columns are factors and all others labels.
+Column ``file``, one list column of float32 per factor, then the label columns; the file's metadata has as
+JSON which is which, and the origin. Without it (files made elsewhere) list columns are factors.
 """
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +34,20 @@ def refuse_folder(path: Path) -> None:
 def write_tables(path: Path, groups: Iterable[FeatureTable]) -> None:
     """Write a table that need never be whole in memory, each of ``groups`` as a row group.
 
-    All groups have the same factors, labels and origin. At ``path`` stands the old file or the whole new one,
-    never half of it.
+    All groups have the same factors, labels and origin. At ``path`` stands the old file or the whole new one.
     """
     refuse_folder(path)
-    writer = None
-    with atomic_file(path, durable=True) as temporary:
-        try:
-            for group in groups:
-                table = as_arrow(group)
-                repeating: Any = list(group.labels)  # a dictionary of features or names helps nothing
-                writer = writer or pq.ParquetWriter(
-                    temporary, table.schema, use_dictionary=repeating, write_page_checksum=True
-                )
-                writer.write_table(table.cast(writer.schema))
-                del table
-                pa.default_memory_pool().release_unused()
-        finally:
-            if writer is not None:
-                writer.close()
+    with atomic_file(path, durable=True) as temporary, ExitStack() as stack:
+        writer = None
+        for group in groups:
+            table = as_arrow(group)
+            if writer is None:
+                labels: Any = list(group.labels)  # a dictionary of features or names helps nothing
+                how = {"use_dictionary": labels, "write_page_checksum": True}
+                writer = stack.enter_context(pq.ParquetWriter(temporary, table.schema, **how))
+            writer.write_table(table.cast(writer.schema))
+            del table
+            pa.default_memory_pool().release_unused()
 
 
 def as_arrow(content: FeatureTable) -> pa.Table:
@@ -65,9 +59,8 @@ def as_arrow(content: FeatureTable) -> pa.Table:
         try:
             columns[name] = pa.array(plain, from_pandas=True)
         except pa.ArrowException as error:
-            raise ValueError(
-                f"label {name!r} mixes kinds of values that no column holds ({error})"
-            ) from error
+            mixed = f"label {name!r} mixes kinds of values that no column holds ({error})"
+            raise ValueError(mixed) from error
     names = {"factors": list(content.factors), "labels": list(content.labels)}
     described = {"format": FORMAT, **names, "origin": dict(content.origin)}
     metadata = {METADATA_KEY: json.dumps(described, ensure_ascii=False).encode()}

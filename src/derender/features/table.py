@@ -59,19 +59,13 @@ class FeatureTable:
             raise ValueError("a feature table needs at least one factor")
         if twice := set(factors) & set(labels) or {"file"} & {*factors, *labels}:
             raise ValueError(f"column name {min(twice)!r} is used twice: rename the factor or the label")
-        for kind, columns, shape in (
-            ("label", labels, "one value"),
-            ("factor", factors, "at least one number"),
-        ):
-            for name, values in columns.items():
-                if values.ndim != (1 if kind == "label" else 2) or 0 in values.shape[1:]:
-                    raise ValueError(
-                        f"{kind} {name!r} must have {shape} in each row, got shape {values.shape}"
-                    )
-                if len(values) != len(self):
-                    raise ValueError(
-                        f"{kind} {name!r} has {len(values)} rows, but there are {len(self)} files"
-                    )
+        for name, values in {**labels, **factors}.items():
+            kind, ndim = ("label", 1) if name in labels else ("factor", 2)
+            if values.ndim != ndim or 0 in values.shape[1:]:
+                each = "one value" if ndim == 1 else "at least one number"
+                raise ValueError(f"{kind} {name!r} must have {each} in each row, got shape {values.shape}")
+            if len(values) != len(self):
+                raise ValueError(f"{kind} {name!r} has {len(values)} rows, but there are {len(self)} files")
         check_finite(factors, self.files)
 
     def __len__(self) -> int:
@@ -99,8 +93,8 @@ class FeatureTable:
     def mean_by(self, *labels: str) -> "FeatureTable":
         """One row for each distinct combination of labels (a face track, say): the mean feature of its rows.
 
-        Rows with one of these labels missing belong to no group and are left out. Of the labels those are
-        kept that are constant inside every group. ``files`` becomes the labels' values joined by "/".
+        Rows with one of these labels missing are left out. Of the labels those are kept that are constant
+        inside every group. ``files`` becomes the labels' values joined by "/".
         """
         if not labels:
             raise ValueError(f"name labels to average by; there is {', '.join(self.labels) or 'none'}")
