@@ -68,12 +68,9 @@ def read_cache(
 
 
 def write_cache(
-    file: Path,
-    fingerprint: str,
-    image_size: int,
-    chunks: Iterator[np.ndarray],
+    file: Path, fingerprint: str, image_size: int, chunks: Iterator[np.ndarray],
     known: Callable[[], dict[str, Any]],
-) -> None:
+) -> None:  # fmt: skip
     """Make the file anew of rows in ``chunks``, (n, 3, S, S) uint8; an OSError says what to do.
 
     ``known`` gives, after the last, what is known of the rows; its "files" name them.

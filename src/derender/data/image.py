@@ -88,12 +88,9 @@ def read_image(
 
 
 def decode(
-    encoded: bytes,
-    image_size: int,
-    fit: str = "crop",
-    box: Float32[np.ndarray, "4"] | None = None,
+    encoded: bytes, image_size: int, fit: str = "crop", box: Float32[np.ndarray, "4"] | None = None,
     pixel_limit: int = PIXEL_LIMIT,
-) -> UInt8[np.ndarray, "3 s s"]:
+) -> UInt8[np.ndarray, "3 s s"]:  # fmt: skip
     """Decode one image; ``Unreadable`` if that cannot be done. Wrap many calls in ``quiet_pillow``."""
     if box is not None and not (np.isfinite(box).all() and (box[2:] > box[:2]).all()):
         raise Unreadable("no usable box is known for the part to read")
@@ -231,12 +228,9 @@ def _from_high_depth(image: Image.Image) -> Image.Image:
 
 
 def fit_square(
-    image: Image.Image,
-    image_size: int,
-    fit: str,
-    resample: Resampling = Resampling.LANCZOS,
+    image: Image.Image, image_size: int, fit: str, resample: Resampling = Resampling.LANCZOS,
     background: int | tuple[int, ...] = _BACKGROUND,
-) -> Image.Image:
+) -> Image.Image:  # fmt: skip
     """Crop, pad or squeeze to a square of the wanted size; maps of classes take NEAREST and a class."""
     size, (width, height) = (image_size, image_size), image.size
     if image.size == size:

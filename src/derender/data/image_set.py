@@ -42,12 +42,9 @@ class Split:
 
 
 def split_indices(
-    files: int | Sequence[str],
-    fractions: tuple[float, float, float] = (0.8, 0.1, 0.1),
-    *,
-    seed: int = 0,
+    files: int | Sequence[str], fractions: tuple[float, float, float] = (0.8, 0.1, 0.1), *, seed: int = 0,
     groups: Sequence[object] | np.ndarray | None = None,
-) -> Split:
+) -> Split:  # fmt: skip
     """Split rows, given by their file names (or only their number), in these fractions.
 
     Without groups the three counts are the fractions of the total, made whole. With groups, each cut is the
@@ -181,19 +178,11 @@ class ImageSet:
 
 
 def read_images(
-    source: str | Path,
-    image_size: int,
-    *,
-    dataset: str = "auto",
-    subset: str | None = None,
-    fit: str = "crop",
-    keep_duplicates: bool = False,
-    limit: int | None = None,
-    cache: str | Path | None = None,
-    memory_limit_bytes: int = MEMORY_LIMIT_BYTES,
-    workers: int | None = None,
-    progress: Progress | None = None,
-) -> ImageSet:
+    source: str | Path, image_size: int, *, dataset: str = "auto", subset: str | None = None,
+    fit: str = "crop", keep_duplicates: bool = False, limit: int | None = None,
+    cache: str | Path | None = None, memory_limit_bytes: int = MEMORY_LIMIT_BYTES,
+    workers: int | None = None, progress: Progress | None = None,
+) -> ImageSet:  # fmt: skip
     """Read every image of a source at ``image_size`` x ``image_size``.
 
     Args:

@@ -63,17 +63,10 @@ class GroundTruth:
 
 
 def read_masks(
-    source: str | Path,
-    image_size: int,
-    *,
-    masks: str | Path | None = None,
-    dataset: str = "auto",
-    subset: str | None = None,
-    fit: str = "crop",
-    workers: int | None = None,
-    progress: Progress | None = None,
-    **reading: Any,
-) -> MaskedImages:
+    source: str | Path, image_size: int, *, masks: str | Path | None = None, dataset: str = "auto",
+    subset: str | None = None, fit: str = "crop", workers: int | None = None,
+    progress: Progress | None = None, **reading: Any,
+) -> MaskedImages:  # fmt: skip
     """Read every image of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
 
     The other options are those of ``read_images``; ``progress`` counts the images and then, from the start,

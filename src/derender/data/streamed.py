@@ -224,15 +224,9 @@ class HuggingFaceStream(Stream):
     layout = "huggingface"
 
     def __init__(
-        self,
-        source: str,
-        place: str | Path,
-        *,
-        split: str | None = None,
-        column: str | None = None,
-        config: str | None = None,
-        revision: str | None = None,
-    ):
+        self, source: str, place: str | Path, *, split: str | None = None, column: str | None = None,
+        config: str | None = None, revision: str | None = None,
+    ):  # fmt: skip
         try:
             import datasets
         except ImportError as problem:

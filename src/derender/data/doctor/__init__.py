@@ -223,13 +223,9 @@ class Examination:
 
 
 def doctor(
-    images: str | Path | ImageSet,
-    *,
-    dataset: str = "auto",
-    limit: int | None = None,
-    seed: int = 0,
+    images: str | Path | ImageSet, *, dataset: str = "auto", limit: int | None = None, seed: int = 0,
     progress: Callable[[int, int], object] | None = None,
-) -> Examination:
+) -> Examination:  # fmt: skip
     """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing.
 
     Args:

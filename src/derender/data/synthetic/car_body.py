@@ -145,12 +145,9 @@ def smooth_grid(points: Float[ndarray, "r c 3"], chart: Float[ndarray, "r c 2"],
 
 
 def rounded_box(
-    centre: Sequence[float],
-    half: Sequence[float],
-    radius: float,
-    surfaces: Surface | Sequence[Surface],
+    centre: Sequence[float], half: Sequence[float], radius: float, surfaces: Surface | Sequence[Surface],
     lean_rad: float = 0.0,
-) -> list[Grid]:
+) -> list[Grid]:  # fmt: skip
     """A box with rounded edges and no underside; ``lean_rad`` tips its top to the rear.
 
     ``surfaces``: one for all faces, or those of top (chart x, z), front and rear (x, y) and sides (z, y).

@@ -63,13 +63,9 @@ _PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.1
 
 
 def generate(
-    count: int,
-    image_size: int = 64,
-    seed: int = 0,
-    settings: CarSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    first: int = 0,
-) -> SyntheticSet:
+    count: int, image_size: int = 64, seed: int = 0, settings: CarSettings | None = None,
+    progress: Callable[[int, int], None] | None = None, first: int = 0,
+) -> SyntheticSet:  # fmt: skip
     """``count`` images, from index ``first`` on; ``progress(done, count)`` is called as they are made.
 
     ``labels`` has ``class``, ``style`` (body style), ``model`` (CLASS/NUMBER) and the turntable's angles in

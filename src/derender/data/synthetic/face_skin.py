@@ -133,13 +133,9 @@ def _beards(p: ndarray, q: ndarray) -> dict[str, ndarray]:
 
 
 def _waves(
-    generator: np.random.Generator,
-    grid: FaceGrid,
-    count: int,
-    shortest: float,
-    longest: float,
+    generator: np.random.Generator, grid: FaceGrid, count: int, shortest: float, longest: float,
     along: float | None = None,
-) -> ndarray:
+) -> ndarray:  # fmt: skip
     """A smooth zero-mean field of unit variance: ``count`` plane waves of such wavelengths (face pixels).
     With ``along`` they run sideways only, mirrored, and bend slowly over that length, like strands."""
     total = np.zeros(grid.p.shape)
@@ -269,13 +265,9 @@ def _hair_thickness(shape: FaceShape, style: HairStyle, volume: float, distance:
 
 
 def paint_eyes(
-    albedo: Float32[ndarray, "n 3 rows columns"],
-    parts: Int32[ndarray, "n rows columns"],
-    grid: FaceGrid,
-    who: Identity,
-    lids: Float32[ndarray, "n 2 2"],
-    gaze: Float32[ndarray, "n 2"],
-) -> None:
+    albedo: Float32[ndarray, "n 3 rows columns"], parts: Int32[ndarray, "n rows columns"], grid: FaceGrid,
+    who: Identity, lids: Float32[ndarray, "n 2 2"], gaze: Float32[ndarray, "n 2"],
+) -> None:  # fmt: skip
     """Paint one person's eyes in place. lids: how wide and how squinted the eye at p < 0 and that at p > 0
     are; gaze: face pixels."""
     rows, columns = np.abs(grid.q[:, 0] - EYE_Q) < 7.0, np.abs(np.abs(grid.p[0]) - EYE_P) < 8.0
@@ -311,12 +303,9 @@ def paint_eyes(
 
 
 def paint_mouth(
-    albedo: Float32[ndarray, "n 3 rows columns"],
-    parts: Int32[ndarray, "n rows columns"],
-    grid: FaceGrid,
-    who: Identity,
-    gap: Float32[ndarray, "n columns"],
-) -> None:
+    albedo: Float32[ndarray, "n 3 rows columns"], parts: Int32[ndarray, "n rows columns"], grid: FaceGrid,
+    who: Identity, gap: Float32[ndarray, "n columns"],
+) -> None:  # fmt: skip
     """Paint one person's open mouths in place; ``gap`` is by how much the lips have parted, face pixels."""
     rows, columns = np.abs(grid.q[:, 0] - MOUTH_Q) < 1.1 * MOUTH_BAND, np.abs(grid.p[0]) < 9.3
     at = np.ix_(rows, columns)

@@ -44,14 +44,10 @@ _DRIFT = np.array([*np.deg2rad([8.0, 18.0, 5.0]), 0.005, 0.005, 0.0])  # how far
 
 
 def generate(
-    count: int,
-    image_size: int = 64,
-    seed: int = 0,
-    settings: FaceSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    first: int = 0,
+    count: int, image_size: int = 64, seed: int = 0, settings: FaceSettings | None = None,
+    progress: Callable[[int, int], None] | None = None, first: int = 0,
     model: MorphableFaces | str | Path | None = None,
-) -> SyntheticSet:
+) -> SyntheticSet:  # fmt: skip
     """``count`` images, from index ``first`` on; ``progress(done, count)`` is called as they are made.
 
     ``model`` replaces the built-in faces by those of a morphable model (a file as in ``morphable``).
@@ -160,13 +156,9 @@ class ProceduralFaces:
         return partial(self._meshes, who, surface, tip, skin), labels, identity_columns(who)
 
     def _meshes(
-        self,
-        who: Identity,
-        surface: Float32[ndarray, "rows columns 3"],
-        nose_tip: float,
-        skin: Skin,
+        self, who: Identity, surface: Float32[ndarray, "rows columns 3"], nose_tip: float, skin: Skin,
         expressions: list[Expression],
-    ) -> list[TriangleMesh]:
+    ) -> list[TriangleMesh]:  # fmt: skip
         """A neutral surface (face pixels) with each expression, in scene units; eyes and mouths painted."""
         grid, scale, count = self.shape.grid, np.float32(who["scale"]), len(expressions)
         surfaces, albedo, parts = (

@@ -86,16 +86,9 @@ def camera_rotation_and_light(
 
 
 def make_set(
-    shots: Callable[[list[int]], Iterable[Shot]],
-    count: int,
-    image_size: int,
-    seed: int,
-    first: int,
-    per_object: int,
-    part_names: tuple[str, ...],
-    progress: Progress | None,
-    effects: EffectSettings,
-) -> SyntheticSet:
+    shots: Callable[[list[int]], Iterable[Shot]], count: int, image_size: int, seed: int, first: int,
+    per_object: int, part_names: tuple[str, ...], progress: Progress | None, effects: EffectSettings,
+) -> SyntheticSet:  # fmt: skip
     """The set of ``count`` images from index ``first`` on; ``shots(indices)`` are some of one object.
 
     Raises:
