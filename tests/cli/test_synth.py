@@ -10,6 +10,7 @@ from tests.cli.conftest import run
 from tests.data.synthetic.test_morphable import dome, saved
 
 from derender.data import synthetic
+from derender.data.layouts.rendered import CAR_CLASSES
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,6 @@ def test_the_benchmark_has_fixed_sets_of_different_people(kind, folder, monkeypa
         assert (folder / f"all-{kind}" / name / "depth").exists() == (name == "test")
     assert len({rows[0]["lx"] for rows in tables.values()}) == len(tables)  # no draw is that of another part
     if kind == "cars":
-        assert {row["class"] for row in tables["test"]} <= {*synthetic.FIVE_CLASSES[9:-1].split(",")}
+        assert {row["class"] for row in tables["test"]} <= {*CAR_CLASSES}
     else:
         assert (folder / "all-faces" / "tracks" / "tracks" / "id0000" / "track_007" / "005.jpg").exists()

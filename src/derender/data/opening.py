@@ -137,14 +137,10 @@ class ListedStream(Stream):
     ):
         self.files = files
         self.layout, self.terms, self.fit = layout.name, layout.terms, layout.fit
-        self._table = table
+        self.table: Table = table  # pyright: ignore[reportIncompatibleVariableOverride]
         self.source = str(files.path) + ("" if half == "all" else f"?half={half}")
         self.source += "" if subset is None else f"::{subset}"
         self.passed_over = (*files.skipped, *table.skipped)
-
-    @property
-    def table(self) -> Table:
-        return self._table
 
     def samples(self, start: int = 0) -> Iterator[Sample]:
         table, count = self.table, len(self.table.files)

@@ -51,11 +51,7 @@ class Stream(Closing, ABC):
     terms: str = ""  # on what terms the owners of a published set give it, in a few words
     passed_over: tuple[Skipped, ...] = ()  # files that are known beforehand to be no use
     limit: int | None = None  # read only the first so many samples; None for all
-
-    @property
-    def table(self) -> Table | None:
-        """Names and labels of every sample where they are known beforehand; None: each brings its own."""
-        return None
+    table: Table | None = None  # of every sample where that is known beforehand; None: each brings its labels
 
     @abstractmethod
     def samples(self, start: int = 0) -> Iterator[Sample]:

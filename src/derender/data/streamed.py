@@ -301,18 +301,17 @@ def _commit(identifier: str, revision: str | None) -> str:
 
     try:
         return HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS).sha or "main"
-    except errors.GatedRepoError as problem:
-        terms = f"https://huggingface.co/datasets/{identifier}"
-        fault = f"{identifier} is gated: accept its terms at {terms} and log in with 'hf auth login'"
-        raise ValueError(f"the data set {fault}") from problem
-    except errors.RepositoryNotFoundError as problem:
-        fault = f"no data set {identifier} (or it is private): check the id, or log in"
-        raise ValueError(f"the Hugging Face Hub has {fault}") from problem
-    except errors.HFValidationError as problem:
-        raise ValueError(f"{identifier!r} is no id of a Hugging Face data set") from problem
     except Exception as problem:  # what a broken connection raises changes with the client's HTTP library
-        fault = f"cannot be asked for {identifier} ({type(problem).__name__}): check the network"
-        raise ValueError(f"the Hugging Face Hub {fault}") from problem
+        hub = "the Hugging Face Hub"
+        fault = f"{hub} cannot be asked for {identifier} ({type(problem).__name__}): check the network"
+        if isinstance(problem, errors.GatedRepoError):
+            terms = f"accept its terms at https://huggingface.co/datasets/{identifier}"
+            fault = f"the data set {identifier} is gated: {terms} and log in with 'hf auth login'"
+        elif isinstance(problem, errors.RepositoryNotFoundError):
+            fault = f"{hub} has no data set {identifier} (or it is private): check the id, or log in"
+        elif isinstance(problem, errors.HFValidationError):
+            fault = f"{identifier!r} is no id of a Hugging Face data set"
+        raise ValueError(fault) from problem
 
 
 def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[str, Any]:

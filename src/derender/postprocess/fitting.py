@@ -24,8 +24,7 @@ from derender.storage.tensors import read_described, write_tensors
 PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
 """Factors that are fitted within the morphable model, and what they fill."""
 
-STEPS = 20
-"""Twice as many bring the error down by half a percent more."""
+STEPS = 20  # twice as many bring the error down by half a percent more
 
 _START_LIMIT = 2.5  # standard deviations; predictions beyond are unreliable
 _COORDINATES = (0.1, -math.inf, math.inf)  # how far a step goes, least and most: standard deviations

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor
 
+from derender.data.source import evenly_spaced
 from derender.scene.crop import DEFAULT_CROPS, CropSettings, crop_images, random_crops
 from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
 
-SAMPLED = 65_536
-"""Images of a memory-mapped set that represent all of them where a few suffice."""
+SAMPLED = 65_536  # images of a memory-mapped set that represent all of them where a few suffice
 
 _STREAMS = {"order": 1, "flip": 2, "perturb": 3, "frame": 4}
 
@@ -106,9 +106,7 @@ def some_of(
     images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"], *, mapped: bool
 ) -> UInt8[np.ndarray, "m 3 h w"]:
     """These images in memory; of a mapped set at most ``SAMPLED``, evenly spread."""
-    if mapped and len(rows) > SAMPLED:
-        rows = rows[np.linspace(0, len(rows) - 1, SAMPLED).astype(np.int64)]
-    return np.ascontiguousarray(images[rows])
+    return np.ascontiguousarray(images[rows[evenly_spaced(len(rows), SAMPLED)] if mapped else rows])
 
 
 class Reader:

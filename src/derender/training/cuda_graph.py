@@ -11,10 +11,8 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-WARMING = 16
-"""Ordinary steps before the clock runs; kernels are compiled in them."""
-TIMED = 16
-"""Steps of either way that are timed."""
+WARMING = 16  # ordinary steps before the clock runs; kernels are compiled in them
+TIMED = 16  # steps of either way that are timed
 
 
 class Replayed:

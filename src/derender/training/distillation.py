@@ -34,8 +34,7 @@ from derender.training.config import FeatureSettings
 from derender.training.features import make_features
 from derender.training.step import fill_uncovered
 
-MEASURED_IMAGES = 256
-"""Images on which standard deviations and errors are measured."""
+MEASURED_IMAGES = 256  # images on which standard deviations and errors are measured
 
 _FIT_BATCH = 128
 _NOISE = 0.03  # mean absolute error of a rendering that counts as much as a gap of 1

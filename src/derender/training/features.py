@@ -122,9 +122,8 @@ def fit_whitening(
             if settings.mirrored:
                 views += [encode(one.flip(-1)) for one in shown]
             for view in views:  # the images first: of a broken rendering every activation is broken
-                _check_finite(
-                    "whitening", {f"the activations of {name}": view[name] for name in names}, start
-                )
+                own = {f"the activations of {name}": view[name] for name in names}
+                _check_finite("whitening", own, start)
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
                 blocks = joined.tensor_split([-HISTOGRAMS] if name in described else [], dim=-1)

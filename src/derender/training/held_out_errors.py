@@ -23,14 +23,10 @@ from derender.storage.folder import QUANTILES, HeldOutErrors
 from derender.storage.places import ERRORS_FILE, bundled_models, model_folder
 from derender.training.process import evaluating
 
-FEWEST = 20
-"""Of fewer images nothing is saved: their largest error says little."""
-OUTLIER_PERCENTILE = 99.0
-"""Images above it are called out-of-distribution."""
-EXPECTED_OUTLIERS = 0.1
-"""Share of the images that may be; of held-out ones 0.01 are."""
-FITTING = 90.0
-"""A model is recommended where images have such a percentile, or less."""
+FEWEST = 20  # of fewer images nothing is saved: their largest error says little
+OUTLIER_PERCENTILE = 99.0  # images above it are called out-of-distribution
+EXPECTED_OUTLIERS = 0.1  # share of the images that may be; of held-out ones 0.01 are
+FITTING = 90.0  # a model is recommended where images have such a percentile, or less
 
 Images = UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"]
 

@@ -44,12 +44,10 @@ LOG_EVERY_STEPS = 50
 READ_EVERY_STEPS = 16
 """Steps after which the host reads the notes of all of them; between, it never waits for the device."""
 MAX_VALIDATION_IMAGES = 1_000
-FIRST_KEPT_IMAGES = 300
-"""About when the first state of a run with long intervals is kept."""
+FIRST_KEPT_IMAGES = 300  # about when the first state of a run with long intervals is kept
 NOT_RECONSTRUCTION = ("l1", "loocc", "cycle")
 
-SampleSheet = Callable[[Any, Tensor], Image.Image]
-"""Draws a model's output for a few images."""
+SampleSheet = Callable[[Any, Tensor], Image.Image]  # draws a model's output for a few images
 
 
 def train_task(task: TrainingTask, images: ImageSet, out: str | Path, **how: Any) -> TrainResult:

@@ -31,8 +31,7 @@ from derender.training.checkpoint import read_state
 from derender.training.config import TrainConfig, to_yaml, without_removed
 from derender.training.process import LOCK_FILE
 
-FORMAT = 1
-"""Of config.yaml, which says so in its first line; one that does not is of this format, too."""
+FORMAT = 1  # of config.yaml, which says so in its first line; one that does not is of this format, too
 
 _MAY_CHANGE_ON_RESUME = (
     *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch", "keep"),
@@ -221,12 +220,7 @@ def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
     names = sha256("\0".join(images.files).encode("utf-8", "backslashreplace")).hexdigest()
     some = images.images[:: max(1, len(images) // 16)].mean(axis=(1, 2, 3)).round(2)
     counts = {name: len(values) for name, values in parts.items()}
-    return {
-        "layout": images.layout,
-        **counts,
-        "names": names,
-        "levels": some.tolist(),
-    }
+    return {"layout": images.layout, **counts, "names": names, "levels": some.tolist()}
 
 
 def _require_same(path: Path, data: dict[str, Any]) -> None:

@@ -19,10 +19,8 @@ from derender.training.distributed import Ranks
 from derender.training.run_folder import RunFolder
 from derender.training.watch import Finding, FiniteWatch
 
-PhaseProgress = Callable[[int, int], None]
-"""Called with (done, total) while a task prepares itself."""
-Precision = Callable[[], AbstractContextManager]
-"""A context in which networks run."""
+PhaseProgress = Callable[[int, int], None]  # called with (done, total) while a task prepares itself
+Precision = Callable[[], AbstractContextManager]  # a context in which networks run
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ Limits were chosen on one half of the material of lab/doctor.md and checked on t
 unreadable, small, oblong, grey and clipped images are conventions.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from derender.data.doctor.measures import JackknifeEstimate
 from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
 from derender.data.source import evenly_spaced, is_image
+from derender.data.stream import Progress
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
@@ -224,7 +225,7 @@ class Examination:
 
 def doctor(
     images: str | Path | ImageSet, *, dataset: str = "auto", limit: int | None = None, seed: int = 0,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Examination:  # fmt: skip
     """Say whether images suit the method: copies, crop, symmetry, view and light. Trains nothing.
 

@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 
 from derender.data.image import DECODER_ERRORS, quiet_pillow, upright_size
 from derender.data.source import Source, evenly_spaced
+from derender.data.stream import Progress
 
 GREY_PX, TINY_PX = 32, 16
 """Sides of the grey images that structure is measured on, and that near copies are detected in."""
@@ -86,9 +87,7 @@ class SymmetryAxis:
     correlation: float  # of the two sides, -1..1, best 1
 
 
-def measure_pixels(
-    images: UInt8[np.ndarray, "n 3 s s"], progress: Callable[[int, int], object] | None = None
-) -> Pixels:
+def measure_pixels(images: UInt8[np.ndarray, "n 3 s s"], progress: Progress | None = None) -> Pixels:
     """Measure every image, in chunks of a mapped set; the side must be a multiple of 32 pixels."""
     parts = []
     for start in range(0, len(images), _CHUNK):

@@ -56,7 +56,7 @@ def _load_classes(source: Source) -> Table:
 _READERS = {  # by name: whether a source looks like the layout, and the table of its images
     "table": (tables.is_listed, tables.load_listed),
     "syncar": (lambda source: "class" in rendered.columns(source), rendered.load_rendered),
-    "synface": (rendered.is_synface, rendered.load_rendered),
+    "synface": (lambda source: "file" in rendered.columns(source), rendered.load_rendered),
     "synface_tracks": (rendered.is_tracks, rendered.load_tracks),
     "depth_pairs": (rendered.is_paired, rendered.load_pairs),
     "rafdb": (lambda source: faces.raf_list(source) is not None, faces.load_rafdb),

@@ -11,8 +11,10 @@ below a folder 02958343, the number of its cars. Words in that table give the la
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
+import yaml
 
 from derender.data.image import DECODER_ERRORS, upright_size
 from derender.data.layouts.layout import (
@@ -34,26 +36,11 @@ from derender.data.source import Source
 LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
 
-# by column of params.csv, what it is called here
-_SAME = ("strength", "age", "skin_tone", "ambient", "diffuse", "gloss_strength", "gloss_exponent")
-_NUMBERS = {name: name for name in (*_SAME, "haze_beta", "haze_airlight")}
-_NUMBERS |= {"tx": "camera_tx", "ty": "camera_ty"}
-_DEGREES = {"light_pitch": "light_pitch_rad", "light_yaw": "light_yaw_rad", "pitch": "camera_x_rad"}
-_DEGREES |= {"yaw": "camera_y_rad", "roll": "camera_z_rad", "elev": "elevation_rad", "azim": "azimuth_rad"}
-_TEXTS = (
-    *("identity", "expression", "class", "model", "track", "frame", "light_kind"),
-    *("hair", "hair_colour", "beard", "style"),
+_NAMES = yaml.safe_load(Path(__file__).with_name("rendered.yaml").read_text(encoding="utf-8"))
+_NUMBERS, _DEGREES, _TEXTS, CAR_CLASSES = (
+    _NAMES[kind] for kind in ("numbers", "degrees", "texts", "car_classes")
 )
 _TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+\.\w+")
-
-CAR_CLASSES = {
-    "police": ("police", "patrol car", "squad car", "prowl car"),
-    "ambulance": ("ambulance",),
-    "limousine": ("limousine", "limo"),
-    "jeep": ("jeep",),
-    "sports": ("sports car", "sport car", "sportscar", "ferrari"),
-}
-"""The words by which a car belongs to one of the paper's five classes; the first class that fits is taken."""
 
 _ID = re.compile(r"(?<![0-9a-f])[0-9a-f]{24,32}(?![0-9a-f])")
 _CARS = "02958343"
@@ -139,11 +126,6 @@ def load_rendered(source: Source) -> Table | None:
     if any(mask in known for mask in masks):
         labels["mask"] = text_column(mask if mask in known else "" for mask in masks)
     return Table(files, labels, partition_column(parent_name(file.rpartition("/")[0]) for file in files))
-
-
-def is_synface(source: Source) -> bool:
-    """Whether the first params.csv is about faces: cars have a class."""
-    return "file" in (result := columns(source)) and "class" not in result
 
 
 def columns(source: Source) -> list[str]:

@@ -4,10 +4,11 @@
 sets. ``write_benchmark`` writes the fixed sets of published scores, which anyone can make again.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from derender.data.stream import Progress
 from derender.data.synthetic import cars, faces
 from derender.data.synthetic.morphable import MorphableFaces
 from derender.data.synthetic.settings import (
@@ -21,6 +22,7 @@ from derender.data.synthetic.settings import (
     LightSettings,
     ViewSettings,
     named_settings,
+    numbers_of,
 )
 from derender.data.synthetic.synthetic_set import SyntheticSet, require_empty, write
 from derender.storage.atomic import atomic_folder
@@ -39,32 +41,24 @@ class BenchmarkPart:
     seed: int
     count: int
     ranges: str = "usual"
-    overrides: tuple[str, ...] = ()
+    overrides: Sequence[str] = ()
     truth: bool = False
 
 
 KINDS = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSettings)}
 """By kind: the generator and its settings."""
 
-FIVE_CLASSES = "classes=[police,ambulance,limousine,jeep,sports]"
 PARTS = {
-    "faces": {
-        "train": BenchmarkPart(20261, 12_000),
-        "test": BenchmarkPart(20263, 800, truth=True),
-        "tracks": BenchmarkPart(20264, 12 * 20 * 6, "wide", ("tracks=20", "frames=6")),
-    },
-    "cars": {
-        "train": BenchmarkPart(20262, 8_000),
-        "test": BenchmarkPart(20265, 1_000, overrides=(FIVE_CLASSES, "pictures_per_model=1"), truth=True),
-    },
+    kind: {name: BenchmarkPart(**row) for name, row in numbers_of(kind)["benchmark"].items()}
+    for kind in KINDS
 }
-"""By kind and folder. No person or car is in two of them, for all seeds differ."""
+"""By kind and folder."""
 
 
 def write_generated(
     kind: str, folder: Path | str, count: int, image_size: int = 64, seed: int = 0,
     settings: FaceSettings | CarSettings | None = None, truth: bool = True,
-    progress: Callable[[int, int], None] | None = None, model: Path | str | None = None,
+    progress: Progress | None = None, model: Path | str | None = None,
 ) -> SyntheticSet:  # fmt: skip
     """Generate "faces" or "cars" into a new folder, which appears when it is complete; gives the set, too.
 
@@ -86,7 +80,7 @@ def write_generated(
 
 
 def write_benchmark(
-    kind: str, folder: Path | str, image_size: int = 64, progress: Callable[[int, int], None] | None = None
+    kind: str, folder: Path | str, image_size: int = 64, progress: Progress | None = None
 ) -> Path:
     """Generate the benchmark of "faces" or "cars" in a new folder, which appears when it is complete.
 

@@ -10,7 +10,7 @@ Rx(elevation) Ry(azimuth) takes the upright car, front towards the viewer, to th
 is the car seen from straight ahead and 42.5 degrees above: the camera's rotation is R = M Rx(42.5)^-1.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from derender.data.stream import Progress
 from derender.data.synthetic.car_body import (
     ARCH,
     BED_FROM,
@@ -64,7 +65,7 @@ _PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.1
 
 def generate(
     count: int, image_size: int = 64, seed: int = 0, settings: CarSettings | None = None,
-    progress: Callable[[int, int], None] | None = None, first: int = 0,
+    progress: Progress | None = None, first: int = 0,
 ) -> SyntheticSet:  # fmt: skip
     """``count`` images, from index ``first`` on; ``progress(done, count)`` is called as they are made.
 

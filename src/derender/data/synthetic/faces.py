@@ -6,7 +6,7 @@ the track. View, gaze and the expression's strength move from one draw to anothe
 Conventions are those of docs/reference/conventions.md; nose tips of neutral faces stand at z = 0.947.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from derender.data import MASK_CLASSES
+from derender.data import MASK_CLASSES, Progress
 from derender.data.synthetic.face_identity import Identity, draw_identity, identity_columns
 from derender.data.synthetic.face_shape import (
     ACTIONS,
@@ -45,7 +45,7 @@ _DRIFT = np.array([*np.deg2rad([8.0, 18.0, 5.0]), 0.005, 0.005, 0.0])  # how far
 
 def generate(
     count: int, image_size: int = 64, seed: int = 0, settings: FaceSettings | None = None,
-    progress: Callable[[int, int], None] | None = None, first: int = 0,
+    progress: Progress | None = None, first: int = 0,
     model: MorphableFaces | str | Path | None = None,
 ) -> SyntheticSet:  # fmt: skip
     """``count`` images, from index ``first`` on; ``progress(done, count)`` is called as they are made.
