@@ -10,9 +10,8 @@ maps          images with masks, with exact depth, normals and albedo
 doctor/       whether a set of images suits the method
 """
 
-from derender.data.cache import cache_folder, sample_checksum
+from derender.data.cache import cache_folder
 from derender.data.image import (
-    READER_VERSION,
     GivenImages,
     Unreadable,
     as_batch,
@@ -24,42 +23,22 @@ from derender.data.image import (
     read_image,
     read_photo,
 )
-from derender.data.image_set import (
-    Duplicate,
-    ImageSet,
-    Split,
-    as_float,
-    read_images,
-    split_indices,
-)
+from derender.data.image_set import Duplicate, ImageSet, Split, as_float, read_images, split_indices
 from derender.data.layouts import LAYOUTS
 from derender.data.layouts.faces import MASK_CLASSES
-from derender.data.layouts.layout import HALVES, half_of, missing
+from derender.data.layouts.layout import half_of, missing
 from derender.data.maps import GroundTruth, MaskedImages, read_ground_truth, read_masks
 from derender.data.opening import ListedStream, list_images, open_images, open_source, parse_source
 from derender.data.source import Skipped, is_image, opened_parquet
-from derender.data.stream import (
-    Decoded,
-    Kinds,
-    Progress,
-    Sample,
-    Stream,
-    Value,
-    column_of,
-    decode_samples,
-    decoded,
-    estimated_total,
-    usable_cores,
-)
+from derender.data.stream import Progress, Sample, Stream, estimated_total, usable_cores
 from derender.storage.places import nearest_sibling, suggestion
 
 __all__ = [
-    "HALVES", "LAYOUTS", "MASK_CLASSES", "READER_VERSION", "Decoded", "Duplicate", "GivenImages",
-    "GroundTruth", "ImageSet", "Kinds", "ListedStream", "MaskedImages", "Progress", "Sample", "Skipped",
-    "Split", "Stream", "Unreadable", "Value", "as_batch", "as_float", "as_photos",
-    "cache_folder", "check_images", "column_of", "decode", "decode_samples", "decode_whole", "decoded",
-    "estimated_total", "half_of", "is_image", "list_images", "missing", "nearest_sibling", "open_images",
-    "open_source", "opened_parquet", "parse_source", "quiet_pillow", "read_ground_truth", "read_image",
-    "read_images", "read_masks", "read_photo", "sample_checksum", "split_indices", "suggestion",
+    "LAYOUTS", "MASK_CLASSES", "Duplicate", "GivenImages", "GroundTruth", "ImageSet", "ListedStream",
+    "MaskedImages", "Progress", "Sample", "Skipped", "Split", "Stream", "Unreadable", "as_batch",
+    "as_float", "as_photos", "cache_folder", "check_images", "decode", "decode_whole",
+    "estimated_total", "half_of", "is_image", "list_images", "missing", "nearest_sibling",
+    "open_images", "open_source", "opened_parquet", "parse_source", "quiet_pillow", "read_ground_truth",
+    "read_image", "read_images", "read_masks", "read_photo", "split_indices", "suggestion",
     "usable_cores",
 ]  # fmt: skip

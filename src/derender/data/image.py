@@ -338,9 +338,8 @@ def refuse_values(images: Tensor | np.ndarray) -> None:
     low, high = float(images.min()), float(images.max())
     if not np.isfinite([low, high]).all():
         first = int(np.isfinite(images.reshape(len(images), -1)).all(axis=1).argmin())
-        raise ValueError(
-            f"image {first} of {len(images)} holds values that are not finite: give numbers in 0..1"
-        )
+        which = f"image {first} of {len(images)}"
+        raise ValueError(f"{which} holds values that are not finite: give numbers in 0..1")
     if low < -1e-3 or high > 1 + 1e-3:
         fix = "divide by 255" if high > 2 else "add 1 and halve" if low >= -1.001 else "rescale them"
         raise ValueError(f"images hold values from {low:.3g} to {high:.3g}, not in 0..1: {fix}")

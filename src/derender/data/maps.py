@@ -105,13 +105,12 @@ def read_masks(
             name = names[row]
             mask = _merged(files, parts[name]) if name in parts else _numbers(files, name, classes, limits)
             if own:
-                width, height = upright_size(files.read(images.files[row]))
+                width, height = upright_size(files.read(image := images.files[row]))
                 rows, columns = mask.shape
                 if abs(columns * height - rows * width) > width + height:
-                    raise ValueError(
-                        f"{name} in {files.path} is {columns} x {rows} and its image {images.files[row]} "
-                        f"{width} x {height}: a mask has the aspect ratio of its image"
-                    )
+                    both = f"{columns} x {rows} and its image {image} {width} x {height}"
+                    rule = "a mask has the aspect ratio of its image"
+                    raise ValueError(f"{name} in {files.path} is {both}: {rule}")
             square = fit_square(Image.fromarray(mask), image_size, fit, Image.Resampling.NEAREST, 0)
             result[row] = np.asarray(square)
 
@@ -158,14 +157,12 @@ def _require_masks(source: Source, images: Sequence[str], masks: Sequence[str]) 
 
 def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
     """A mask that holds class numbers; a palette's colours do not matter."""
-    values = np.asarray(_opened(source, file))
+    values, where = np.asarray(_opened(source, file)), f"{file} in {source.path}"
     if values.ndim > 2:
-        raise ValueError(
-            f"{file} in {source.path} has {values.shape[2]} channels; a mask has one, of class numbers"
-        )
+        raise ValueError(f"{where} has {values.shape[2]} channels; a mask has one, of class numbers")
     if values.min() < 0 or values.max() >= classes:
         wrong = int(values.min() if values.min() < 0 else values.max())
-        raise ValueError(f"{file} in {source.path} holds the number {wrong}; classes are {limits}")
+        raise ValueError(f"{where} holds the number {wrong}; classes are {limits}")
     return values.astype(np.uint8)
 
 
@@ -204,12 +201,9 @@ def _class_names(source: Source, masks: UInt8[np.ndarray, "n s s"], files: list[
     else:
         return tuple(f"class {number}" for number in range(int(largest.max()) + 1))
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
-    if int(largest.max()) >= len(names):
-        file = files[int(largest.argmax())]
-        raise ValueError(
-            f"{file} in {source.path} holds the number {int(largest.max())}; {listed} names "
-            f"{len(names)} classes"
-        )
+    if (most := int(largest.max())) >= len(names):
+        where = f"{files[int(largest.argmax())]} in {source.path}"
+        raise ValueError(f"{where} holds the number {most}; {listed} names {len(names)} classes")
     return names
 
 
@@ -222,7 +216,7 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
 
     with_depth = np.flatnonzero([name in known for name in map_names("depth")])
     if not len(with_depth):
-        expected = "; ".join(map_names("depth")[:1])
+        expected = "".join(map_names("depth")[:1])
         raise ValueError(f"{source.path} has no depth maps for its images (expected {expected})")
     table = table.select(with_depth[evenly_spaced(len(with_depth), limit)])
     missing = [name for name in (*LIGHT, *CAMERA) if name not in table.labels]
@@ -240,10 +234,8 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
             opened = _opened(source, name)
             array = np.asarray(opened)
             if opened.mode not in modes or (arrays and array.shape != arrays[0].shape):
-                raise ValueError(
-                    f"{name} in {source.path} is {opened.mode} {array.shape}; "
-                    f"expected {modes[0]}, and all of one size"
-                )
+                what = f"{name} in {source.path} is {opened.mode} {array.shape}"
+                raise ValueError(f"{what}; expected {modes[0]}, and all of one size")
             arrays.append(array)
         return np.stack(arrays)
 
@@ -303,9 +295,8 @@ def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarr
     if mode == "RGB" and (code == code[..., :1]).all():
         code = code[..., 0]
     if code.ndim != 2 or mode not in ("L", "RGB", "I;16", "I"):
-        raise ValueError(
-            f"{file} in {source.path} is {mode} {code.shape}; a depth map is a grey PNG of 8 or 16 bits"
-        )
+        what = f"{file} in {source.path} is {mode} {code.shape}"
+        raise ValueError(f"{what}; a depth map is a grey PNG of 8 or 16 bits")
     (near, far), mask = DEPTH_RANGE, code > 0
     nearness = code / (255 if code.dtype == np.uint8 else 65_535)
     depth = np.where(mask, far - (far - near) * nearness, 0).astype(np.float32)

@@ -26,19 +26,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
-from derender.data import (
-    Decoded,
-    ImageSet,
-    Kinds,
-    Sample,
-    Skipped,
-    Stream,
-    Unreadable,
-    column_of,
-    decode_samples,
-    decoded,
-    quiet_pillow,
-)
+from derender.data import ImageSet, Skipped, Unreadable, quiet_pillow
+from derender.data.stream import Decoded, Kinds, Sample, Stream, column_of, decode_samples, decoded
 from derender.features.extract import as_batch, evaluating, factor_codes
 from derender.features.parquet import factor_column, factor_values
 from derender.features.table import FeatureTable, check_finite

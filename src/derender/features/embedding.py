@@ -17,15 +17,9 @@ from typing import Any, Literal
 import PIL
 import torch
 
-from derender.data import (
-    READER_VERSION,
-    ImageSet,
-    Skipped,
-    Stream,
-    estimated_total,
-    open_images,
-    sample_checksum,
-)
+from derender.data import ImageSet, Skipped, Stream, estimated_total, open_images
+from derender.data.cache import sample_checksum
+from derender.data.image import READER_VERSION
 from derender.features.blocks import PARTS_FORMAT, Parts, Rows, local_blocks, ray_blocks, rows_of
 from derender.features.extract import check_size, embed_image_set, model_facts, table_labels
 from derender.features.parquet import refuse_folder, write_tables
@@ -120,9 +114,8 @@ def embed_to_file(
     """
     path = Path(out)
     if path.suffix.lower() not in ("", ".parquet"):
-        raise ValueError(
-            f"{out}: a feature table is a parquet file, name it so (pandas.read_parquet reads it)"
-        )
+        how = "name it so (pandas.read_parquet reads it)"
+        raise ValueError(f"{out}: a feature table is a parquet file, {how}")
     refuse_folder(path)
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
@@ -221,10 +214,8 @@ def _compute(
         if not parts.files:
             parts.remove()
         elif isinstance(stopped, KeyboardInterrupt):
-            raise KeyboardInterrupt(
-                f"stopped by Ctrl-C; {parts.rows:,} rows are kept in {parts.folder}: "
-                "the same command continues from there"
-            ) from stopped
+            kept = f"{parts.rows:,} rows are kept in {parts.folder}: the same command continues from there"
+            raise KeyboardInterrupt(f"stopped by Ctrl-C; {kept}") from stopped
         raise
     if progress is not None:
         progress(parts.following, parts.following)

@@ -88,10 +88,8 @@ def read_table(path: Path, only: str | None = None) -> FeatureTable:
         table = opened.read([name for name in schema.names if name not in names or name in factors])
     others = [name for name in table.column_names if name != "file"]
     if len(others) == len(table.column_names):
-        raise ValueError(
-            f"{path} has no column 'file' (it has {', '.join(others) or 'no columns'}): add one with the "
-            "images' names"
-        )
+        it_has = f"it has {', '.join(others) or 'no columns'}"
+        raise ValueError(f"{path} has no column 'file' ({it_has}): add one with the images' names")
     labels = described.get("labels", [name for name in others if name not in factors])
     if not factors:
         raise ValueError(f"{path} has no column of lists, so no features: make it with 'derender embed'")

@@ -72,11 +72,9 @@ class MorphableMaps(nn.Module):
         super().__init__()
         self.names = tuple(means)
         for name in self.names:
-            if axes[name].shape[1:] != means[name].shape:
-                raise ValueError(
-                    f"{name}: axes of {tuple(axes[name].shape[1:])} beside a mean of "
-                    f"{tuple(means[name].shape)}"
-                )
+            one, other = tuple(axes[name].shape[1:]), tuple(means[name].shape)
+            if one != other:
+                raise ValueError(f"{name}: axes of {one} beside a mean of {other}")
             self.register_buffer(f"{name}_mean", means[name].float(), persistent=False)
             self.register_buffer(f"{name}_axes", axes[name].float(), persistent=False)
 

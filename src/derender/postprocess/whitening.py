@@ -87,9 +87,8 @@ def fit_projection(
     from scipy.linalg import eigh  # only the kept directions: torch would find all, three times as slow
 
     if scatter.views < 2 or scatter.count < 2:
-        raise ValueError(
-            f"whitening needs at least 2 views of 2 images, got {scatter.views} of {scatter.count}"
-        )
+        got = f"got {scatter.views} of {scatter.count}"
+        raise ValueError(f"whitening needs at least 2 views of 2 images, {got}")
     mean, within, between = scatter.mean, scatter.within, scatter.between
     width = len(mean)
     size = size or width

@@ -43,9 +43,8 @@ def saved_config(folder: Path) -> dict[str, Any]:
     config = read_json(folder / CONFIG_FILE, dict[str, Any])
     version = config.get("format")
     if isinstance(version, int) and version > FORMAT:
-        raise ValueError(
-            f"{folder} was saved in format {version}, this version reads up to {FORMAT}: update derender"
-        )
+        newer = f"was saved in format {version}, this version reads up to {FORMAT}"
+        raise ValueError(f"{folder} {newer}: update derender")
     if version != FORMAT or not isinstance(config.get("settings"), dict):
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config
@@ -73,10 +72,8 @@ def check_factors(folder: Path, config: Mapping[str, Any], factors: Sequence[str
     """A ValueError where a saved model's configuration is of other factors."""
     names = config["factors"]
     if names != list(factors):
-        raise ValueError(
-            f"{folder} holds factors {', '.join(names)}, asked for {', '.join(factors)}: "
-            "pass its rows as factors="
-        )
+        both = f"{', '.join(names)}, asked for {', '.join(factors)}"
+        raise ValueError(f"{folder} holds factors {both}: pass its rows as factors=")
 
 
 def write_config(folder: Path, factors: Sequence[str], settings: Settings) -> None:
@@ -107,9 +104,8 @@ def naming_damage(folder: Path) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError) as error:
-        raise ValueError(
-            f"{folder} is damaged ({first_line(error)}): copy or train the model again"
-        ) from error
+        why = first_line(error)
+        raise ValueError(f"{folder} is damaged ({why}): copy or train the model again") from error
 
 
 class HeldOutErrors(Settings):

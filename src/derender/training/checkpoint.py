@@ -80,10 +80,8 @@ def save_checkpoint(
             content = save({key: value.detach().cpu().contiguous() for key, value in tensors.items()})
             (temporary / name).write_bytes(content)
             if (temporary / name).read_bytes() != content:
-                raise OSError(
-                    f"{temporary / name} reads back other than it was written: check the disk; the old one "
-                    "is kept"
-                )
+                other = f"{temporary / name} reads back other than it was written"
+                raise OSError(f"{other}: check the disk; the old one is kept")
         described = {"format": FORMAT, "state": asdict(state), "groups": kept["param_groups"]}
         (temporary / STATE_FILE).write_text(json.dumps(described, default=float))  # a rate on the device
         seal(temporary)
@@ -142,10 +140,8 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
     except (ValueError, OSError) as error:
         raise DamagedCheckpoint(folder, first_line(error)) from error
     if newer:
-        raise ValueError(
-            f"the checkpoint {folder} was made in format {version}, this version reads up to {FORMAT}: "
-            "update derender"
-        )
+        made = f"was made in format {version}, this version reads up to {FORMAT}"
+        raise ValueError(f"the checkpoint {folder} {made}: update derender")
     try:
         state = TypeAdapter(TrainState).validate_json(json.dumps(stored.state))
         fit_weights(model, weights)

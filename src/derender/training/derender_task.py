@@ -115,9 +115,8 @@ class DerenderTask(TrainingTask):
                 weights |= load(start).state_dict()
                 fit_weights(model, {k: v for k, v in weights.items() if not k.startswith("unet_decoder.")})
             except ValueError as error:
-                raise ValueError(
-                    f"cannot start from {start}: {error}; leave its network settings as they are"
-                ) from error
+                why = f"{error}; leave its network settings as they are"
+                raise ValueError(f"cannot start from {start}: {why}") from error
         return model.with_features(Features(self.whitening))
 
     def step_module(
@@ -148,9 +147,8 @@ class DerenderStep(nn.Module):
     ) -> tuple[Tensor, Held]:  # fmt: skip
         objective, chunks = self.config.objective, self.config.accumulate
         own, ranks = (1.0, ALONE) if done is None else (own_share(objective, done), self.ranks)
-        result = training_step(
-            self.model, images, objective, self.perceptual, generator, precision, own, ranks, chunks
-        )
+        how = generator, precision, own, ranks, chunks
+        result = training_step(self.model, images, objective, self.perceptual, *how)
         return result.total, Held(result)
 
 
@@ -162,9 +160,8 @@ def self_features_of(
         try:
             return load_self_features(file).to(images.device)
         except ValueError as problem:
-            warnings.warn(
-                f"{problem}: they are learnt again, from the same seed", DamageNoticed, stacklevel=2
-            )
+            again = f"{problem}: they are learnt again, from the same seed"
+            warnings.warn(again, DamageNoticed, stacklevel=2)
     features = train_self_features(
         images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total)
     )
@@ -180,9 +177,8 @@ def perceptual_of(
     if objective.perceptual == "none" or objective.perceptual_weight == 0:
         return None
     if objective.perceptual == "self":
-        features = self_features_of(
-            run.perceptual, images, config.seed, objective.self_features_steps, progress
-        )
+        steps = objective.self_features_steps
+        features = self_features_of(run.perceptual, images, config.seed, steps, progress)
     else:
         features = load_vgg16(objective.vgg16_path).to(images.device)
         if objective.perceptual_rescaled:

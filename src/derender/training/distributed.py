@@ -129,10 +129,8 @@ def open_fabric(accelerator: str) -> Any:
     known = signature(torch.nn.parallel.DistributedDataParallel.__init__).parameters
     buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
     options: dict[str, Any] = {"find_unused_parameters": True, buffers: False}
-    local = int(os.environ["LOCAL_WORLD_SIZE"])
-    fabric = Fabric(
-        accelerator=accelerator, devices=local, num_nodes=world // local, strategy=DDPStrategy(**options)
-    )
+    local, strategy = int(os.environ["LOCAL_WORLD_SIZE"]), DDPStrategy(**options)
+    fabric = Fabric(accelerator=accelerator, devices=local, num_nodes=world // local, strategy=strategy)
     fabric.launch()
     return fabric
 

@@ -48,10 +48,8 @@ def reconstruction_errors(model: Any, images: Images, batch_size: int = 64) -> F
             parts.append(masked_l1(model.reconstruct(target), target).cpu())
     errors = torch.cat(parts).numpy()
     if broken := int(np.isnan(errors).sum()):
-        raise NotFinite(
-            f"the reconstructions of {broken} of {len(errors)} images are NaN: the model's training went "
-            "wrong"
-        )
+        which = f"the reconstructions of {broken} of {len(errors)} images"
+        raise NotFinite(f"{which} are NaN: the model's training went wrong")
     return errors
 
 

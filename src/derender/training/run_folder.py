@@ -143,10 +143,8 @@ def read_settings(
         raise ValueError(f"{file} {otherwise} ({error})") from error
     result = tree.pop("format", FORMAT)
     if not isinstance(result, int) or result > FORMAT:
-        shown = Repr().repr(result)
-        raise ValueError(
-            f"{file} was written in format {shown}, this version reads up to {FORMAT}: update derender"
-        )
+        newer = f"was written in format {Repr().repr(result)}, this version reads up to {FORMAT}"
+        raise ValueError(f"{file} {newer}: update derender")
     return without_removed(tree)
 
 
@@ -181,9 +179,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         except ValueError as error:
             if number == len(lines) and line[:1] == b"{" and line[-1:] != b"\n":  # cut off by a kill
                 break
-            raise ValueError(
-                f"{file} is damaged (line {number}: {first_line(error)}): delete that line"
-            ) from error
+            where = f"line {number}: {first_line(error)}"
+            raise ValueError(f"{file} is damaged ({where}): delete that line") from error
     return rows
 
 
@@ -232,6 +229,5 @@ def _require_same(path: Path, data: dict[str, Any]) -> None:
     if same and np.allclose(began["levels"], data["levels"], rtol=0, atol=1):  # decoders differ by less
         return
     one, other = (f"{each.get('pictures')} images ({each.get('layout')})" for each in (began, data))
-    raise ValueError(
-        f"{path} was trained on {one}, not on these {other}: resume with those or set start_from"
-    )
+    fix = "resume with those or set start_from"
+    raise ValueError(f"{path} was trained on {one}, not on these {other}: {fix}")

@@ -79,10 +79,8 @@ def distil_unets(
     """
     settings = settings or UNetSettings()
     if len(images) < 2 or images.shape[-1] != model.image_size:
-        raise ValueError(
-            f"U-Nets need 2 images or more of {model.image_size} pixels to learn from, got {len(images)} of "
-            f"{images.shape[-1]}"
-        )
+        got = f"got {len(images)} of {images.shape[-1]}"
+        raise ValueError(f"U-Nets need 2 images or more of {model.image_size} pixels to learn from, {got}")
     if (smaller := model.settings.network.grown_from) is not None:
         raise ValueError(f"a model grown from {smaller} pixels takes no U-Nets: give the smaller model")
     for name in PIXEL_CHANNELS:
@@ -126,9 +124,8 @@ def _learn(
     alone = nn.ModuleList([*encoders.values(), heads])
     learning = nn.ModuleList([alone, joint])
     learning.requires_grad_(True).train().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    optimiser = torch.optim.AdamW(
-        learning.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
-    )
+    rate, decay = settings.learning_rate, settings.weight_decay
+    optimiser = torch.optim.AdamW(learning.parameters(), rate, weight_decay=decay)
     with torch.no_grad():
         codes = model.encode(as_float(images[:MEASURED_IMAGES]).to(model.device))
     deviation = {name: codes[name].std(dim=0) for name in PIXEL_CHANNELS}

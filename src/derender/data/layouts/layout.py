@@ -198,23 +198,20 @@ def number_column(values: Iterable[float]) -> np.ndarray:
 
 def read_csv(source: Source, file: str, required: Sequence[str] = ()) -> list[Mapping[str, str]]:
     """The rows of a CSV file with a header; a missing column or a ragged row is an error that names it."""
+    where = f"{file} in {source.path}"
     reader = csv.DictReader(io.StringIO(source.read_text(file), newline=""))
     try:
         header = [name.strip() for name in reader.fieldnames or ()]
         reader.fieldnames = header
         rows = [(reader.line_num, row) for row in reader]
     except csv.Error as problem:
-        raise ValueError(f"{file} in {source.path} is no CSV table ({problem})") from problem
-    missing = [name for name in required if name not in header]
-    if missing:
-        raise ValueError(
-            f"{file} in {source.path} has no column {missing[0]!r}; its columns are {', '.join(header)}"
-        )
+        raise ValueError(f"{where} is no CSV table ({problem})") from problem
+    for name in required:
+        if name not in header:
+            raise ValueError(f"{where} has no column {name!r}; its columns are {', '.join(header)}")
     for number, row in rows:
         if None in row or None in row.values():
-            raise ValueError(
-                f"{file} in {source.path}, line {number}: expected {len(header)} values as in the header"
-            )
+            raise ValueError(f"{where}, line {number}: expected {len(header)} values as in the header")
     return [row for _, row in rows]
 
 
@@ -237,7 +234,7 @@ def read_list(
     rows = []
     for number, line in enumerate(map(str.strip, source.read_text(file).splitlines() or [""]), 1):
         is_header = number == 1 and header is not None
-        match = re.fullmatch(header if number == 1 and header is not None else row, line)
+        match = re.fullmatch((header or row) if number == 1 else row, line)
         if match is None and (line or is_header):
             raise ValueError(f"{file} in {source.path}, line {number}: expected {expected}, got {line!r}")
         if match is not None and not is_header:

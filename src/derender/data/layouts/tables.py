@@ -88,10 +88,8 @@ def load_listed(source: Source) -> Table | None:
     skipped = tuple(Skipped(path, missing) for path in paths if path not in images)
     if not rows:
         first = f": the first is {paths[0]!r}" if paths else ""
-        raise ValueError(
-            f"the column {column!r} of {file} in {source.path} names no image that is there{first}; "
-            f"paths are relative to the table"
-        )
+        what = f"the column {column!r} of {file} in {source.path} names no image that is there"
+        raise ValueError(f"{what}{first}; paths are relative to the table")
     partition, labels = None, {}
     for name, values in columns.items():
         values = [values[row] for row in rows]
@@ -125,24 +123,20 @@ def _is_number(value: str) -> bool:
 
 def _columns(source: Source, file: str) -> tuple[str, list[str], dict[str, list[str]]]:
     """The name of the column of paths, the paths relative to the source, and the other columns."""
-    cells = _cells(source, file)
+    cells, where = _cells(source, file), f"{file} in {source.path}"
     column = next((name for known in PATH_COLUMNS for name in cells if name.lower() == known), None)
     if column is None:
-        raise ValueError(
-            f"{file} in {source.path} has no column of paths ({', '.join(PATH_COLUMNS)}); "
-            f"its columns are {', '.join(cells)}"
-        )
+        known = f"its columns are {', '.join(cells)}"
+        raise ValueError(f"{where} has no column of paths ({', '.join(PATH_COLUMNS)}); {known}")
     folder = str(PurePosixPath(file).parent)
     paths: dict[str, None] = {}
     for number, written in enumerate(cells.pop(column), 1):
         path = str(PurePosixPath(folder, written.replace("\\", "/")))
         if not written or _UNSAFE.search(written):
-            raise ValueError(
-                f"{file} in {source.path}, row {number}: expected a path relative to the table and below it, "
-                f"got {written!r}"
-            )
+            expected = "expected a path relative to the table and below it"
+            raise ValueError(f"{where}, row {number}: {expected}, got {written!r}")
         if path in paths:
-            raise ValueError(f"{file} in {source.path}, row {number}: {path!r} is there twice")
+            raise ValueError(f"{where}, row {number}: {path!r} is there twice")
         paths[path] = None
     return column, list(paths), {name: values for name, values in cells.items() if name}
 
@@ -154,16 +148,18 @@ def _cells(source: Source, file: str) -> dict[str, list[str]]:
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else header_of(source, file))}
     import pyarrow as pa
 
+    where = f"{file} in {source.path}"
     try:
         table = opened_parquet(source.read(file)).read()
     except (pa.ArrowException, OSError) as problem:
-        raise ValueError(f"{file} in {source.path} is no Parquet table ({problem})") from problem
+        raise ValueError(f"{where} is no Parquet table ({problem})") from problem
     except ValueError as problem:
-        raise ValueError(f"{file} in {source.path} is damaged ({problem}): restore it") from problem
+        raise ValueError(f"{where} is damaged ({problem}): restore it") from problem
     if nested := _not_cells(table.schema):
+        column = table.schema.field(nested[0])
         raise ValueError(
-            f"column {nested[0]!r} of {file} in {source.path} holds {table.schema.field(nested[0]).type}; "
-            f"expected paths, numbers and text (images kept inside a table are not read)"
+            f"column {column.name!r} of {where} holds {column.type}; expected paths, numbers and text "
+            "(images kept inside a table are not read)"
         )
     cells = {name: table[name].to_pylist() for name in table.column_names}
     return {name: ["" if one is None or one != one else str(one) for one in cells[name]] for name in cells}
