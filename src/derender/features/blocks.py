@@ -3,8 +3,8 @@
 In this process a pool decodes ahead of the model. With Ray Data, actors each open the stream themselves; only
 features, names, labels and digests of pixels travel. Rows are the same bits.
 
-An unfinished table is a folder of parts, each written atomically, for a later run to resume, and a
-``plan.json`` of what they are made of. A part holds some thousand rows, their positions and digests of
+An unfinished table is a folder of parts, each written atomically, for a later run to resume. ``plan.json`` is
+what they are made of. A part holds some thousand rows, their positions and digests of
 pixels, and where to continue. The checksum of a part is in its name: one that is damaged or missing is made
 again, with those after it. Labels of a stream stay as JSON until their kinds are known, at the end.
 """

@@ -1,8 +1,8 @@
 """Whether a set of images suits the method, before anyone trains: ``doctor``.
 
 Each of the measures (measures.py) becomes a finding by the limits in ``checks.yaml``, all of them a verdict.
-Limits were chosen on one half of the material of lab/doctor.md and checked on the other; those on distinct,
-unreadable, small, oblong, grey and clipped images are conventions.
+Limits were chosen on one half of the material of lab/doctor.md and checked on the other. Those on distinct,
+unreadable, small, oblong, grey and clipped images are conventions: nothing was measured to set them.
 """
 
 from collections.abc import Mapping, Sequence

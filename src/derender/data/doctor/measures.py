@@ -121,10 +121,10 @@ def _averaged(grey: Float32[np.ndarray, "n h w"], side: int) -> Float32[np.ndarr
 def near_copy_groups(tiny: Float32[np.ndarray, "n d"]) -> Int64[np.ndarray, " n"]:
     """For each image the first image of its group; itself where it has no earlier near copy.
 
-    Two images are near copies if their tiny grey versions (rows of length 1; of 0 for blank images, copies of
-    one another) correlate by ``COPY_CORRELATION`` or more. Candidates come from a k-d tree over the leading
-    principal components, in which none are farther apart than in full. Groups are connected pairs. Leaves out
-    colour, mirrored copies, and copies cropped otherwise.
+    Two images are near copies if their tiny grey versions correlate by ``COPY_CORRELATION`` or more. Rows
+    have length 1, or 0 for blank images, which count as copies. Candidates come from a k-d tree over the
+    leading principal components, in which none are farther apart than in full. Groups are connected pairs.
+    Leaves out colour, mirrored copies, and copies cropped otherwise.
     """
     group = np.arange(len(tiny))
     sample = tiny[evenly_spaced(len(tiny), _SAMPLE)]

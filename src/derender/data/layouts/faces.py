@@ -10,7 +10,7 @@ from a list of the user's own or from the landmarks: the box of CelebA-HQ withou
 Progressive Growing of GANs, 2018, appendix C). E is the eyes' middle, e their distance, M the middle of the
 mouth's corners, m = |E - M|. The side is max(4 e, 3.6 m), the middle E + 0.1 (E - M). Masks of CelebAMask-HQ
 come in parts as published, or merged. The owners' script for the official partition compares a count from
-zero with CelebA's numbers, which start at one; here an image is in the part in which CelebA has it.
+zero with CelebA's numbers, which start at one. Here an image is in the part in which CelebA has it.
 """
 
 import re
