@@ -22,7 +22,7 @@ BUDGET = {  # lines, files
     "cli": (2_325, 32),  # the same
     "training": (3_360, 17),  # CUDA graphs; the model that fits better
     "baselines": (2_465, 11),
-    "render": (1_690, 15),
+    "render": (1_685, 15),
     "features": (1_310, 8),  # a folder is refused before images are embedded
     "interpretation": (1_075, 5),
     "photo": (1_615, 7),  # over-exposed skin; why a photograph does not suit a model; its scene
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_275, 238)  # on the way to (37_000, 270)
-TEST_LINES = 26_060
+TOTAL = (39_280, 238)  # on the way to (37_000, 270)
+TEST_LINES = 26_065
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

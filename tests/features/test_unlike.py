@@ -38,3 +38,7 @@ def test_embed_tells_it_and_keeps_identical_images_on_request(made, tmp_path, ca
 def test_a_device_that_is_missing_is_named():
     with pytest.raises(ValueError, match="no CUDA device here"):
         derender.load("cars-64").to("cuda")
+    with pytest.raises(ValueError, match="unknown device: give 'cpu' or 'cuda'"):
+        derender.load("rendered-faces-64", device="gpu")
+    with pytest.raises(TypeError, match="None"):
+        derender.load(None)

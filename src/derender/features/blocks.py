@@ -4,9 +4,9 @@ In this process a pool decodes ahead of the model. With Ray Data, actors each op
 features, names, labels and digests of pixels travel. Rows are the same bits.
 
 An unfinished table is a folder of parts, each written atomically, for a later run to resume. ``plan.json`` is
-what they are made of. A part holds some thousand rows, their positions and digests of
-pixels, and where to continue. The checksum of a part is in its name: one that is damaged or missing is made
-again, with those after it. Labels of a stream stay as JSON until their kinds are known, at the end.
+what they are made of. A part holds some thousand rows, their positions and digests of pixels, and where to
+continue. The checksum of a part is in its name: one that is damaged or missing is made again, with those
+after it. Labels of a stream stay as JSON until their kinds are known, at the end.
 """
 
 import json
@@ -106,8 +106,9 @@ def ray_blocks(
 ) -> Iterator[Iterator[Block]]:  # fmt: skip
     """As ``local_blocks``, with ``workers`` actors of one core each, or of one GPU each for a model on one.
 
-    Every machine must be able to open the data under the same name. Without a cluster (``ray start``,
-    RAY_ADDRESS) the actors are processes on this machine. A ValueError: Ray is not installed.
+    Ray starts an actor anew when its process or machine dies, and gives its block to another. Every machine
+    must be able to open the data under the same name. Without a cluster (``ray start``, RAY_ADDRESS) the
+    actors are processes on this machine. A ValueError: Ray is not installed.
     """
     ray = optional("ray", "engine 'ray'", "ray")
     optional("ray.data", "engine 'ray'", "ray")

@@ -127,6 +127,8 @@ class EmbeddingModel(nn.Module):
         except (AssertionError, RuntimeError) as problem:
             if "cuda" in str((*args, *kwargs.values())) and not torch.cuda.is_available():
                 raise ValueError("no CUDA device here: leave the model on 'cpu'") from problem
+            if "device type" in str(problem):
+                raise ValueError(f"unknown device: give 'cpu' or 'cuda', got {args or kwargs}") from problem
             raise
 
     @property

@@ -65,6 +65,8 @@ def bundled(name: str) -> dict[str, Any]:
 
 def model_folder(source: str | Path) -> Path:
     """The folder that ``load`` reads for this source; a FileNotFoundError where nothing is there."""
+    if not isinstance(source, (str, Path)):
+        raise TypeError(f"a model is given by its name or folder, got {source!r}")
     folder = Path(source)
     for candidate in (folder, folder / "model"):
         if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():

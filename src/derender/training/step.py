@@ -1,7 +1,8 @@
 """The losses of one training step: decompose, render the scene and its flipped twin, compare; then LOOCC.
 
-Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). Several devices may share a
-batch (distributed.py), and it may be computed in chunks: the losses stay its own.
+Source: unsup3d Sec. 3 (reconstruction), Klinghoffer et al. Sec. 3.2 (LOOCC). The twin reuses the decoded
+maps, and perturbed scenes are rendered in the same call. Several devices may share a batch (distributed.py),
+and it may be computed in chunks: the losses stay its own.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -135,7 +136,8 @@ def perturb_one_factor(
 ) -> tuple[Scene, Int[Tensor, " n"]]:
     """Change one factor of every scene, drawn per image; also which, as an index into ``model.factors``.
 
-    Ranks draw for all of the batch, as one process would.
+    Ranks draw for all of the batch, as one process would. A ValueError: ``objective.loocc`` names no factor
+    of the model that can be perturbed.
     """
     factors = loocc_factors(objective.loocc, model.factors)
     names = [factor.name for factor in model.factors]
@@ -169,7 +171,8 @@ def cycle_loss(
 ) -> Float[Tensor, ""]:  # fmt: skip
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
-    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors.
+    Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors. The
+    rendered scene is a fixed, exact target for what an image alone leaves open (pitch above all).
     """
     total = rendered.depth.new_zeros(())
     for factor in loocc_factors(objective.loocc, model.factors):
