@@ -6,16 +6,15 @@ from typing import Any
 
 
 def renderers(result: Any) -> Iterator[list[str]]:
-    """Reconstruction error of scenes optimised with each renderer, by effect, mean over seeds."""
-    cells = result["cells"]
-    names = list(dict.fromkeys(one["renderer"] for one in cells))
-    yield ["effect in the images; L1 with", *names]
-    for effect in dict.fromkeys(one["effect"] for one in cells):
-        means = []
-        for name in names:
-            errors = [one["l1"] for one in cells if (one["effect"], one["renderer"]) == (effect, name)]
-            means.append(f"{sum(errors) / len(errors):.4f}" if errors else "")
-        yield [effect, *means]
+    """Errors of scenes optimised with the renderer of an effect, beside ``lambert``: mean, deviation."""
+    yield [
+        *("effect, renderer", "L1 / lambert's", "normals, degrees", "of lambert"),
+        *("albedo error / lambert's", "the same without the effect"),
+    ]
+    groups = _trained(result)
+    for effect, name in _knowing(groups):
+        reconstructed = spread(_ratios(groups, (effect, name), (effect, "lambert"), "l1"), 2)
+        yield [f"{effect}: {name}", reconstructed, *_compared(groups, effect, name)]
 
 
 def renderer_speed(result: Any) -> Iterator[list[str]]:
@@ -33,17 +32,29 @@ def renderers_trained(result: Any) -> Iterator[list[str]]:
         *("albedo error / lambert's", "the same without the effect", "lambert's with / without the effect"),
     ]
     groups = _trained(result)
-    for effect, name in [pair for pair in groups if "lambert" not in pair[1:] and pair[0] != "none"]:
-        normals = (spread([one["normal_deg"] for one in groups[effect, own]], 1) for own in (name, "lambert"))
-        plain, hit = ("none", "lambert"), (effect, "lambert")
-        pairs = (((effect, name), hit), (("none", name), plain), (hit, plain))
-        yield [f"{effect}: {name}", *normals, *(spread(_ratios(groups, *pair), 2) for pair in pairs)]
+    for effect, name in _knowing(groups):
+        hit = spread(_ratios(groups, (effect, "lambert"), ("none", "lambert")), 2)
+        yield [f"{effect}: {name}", *_compared(groups, effect, name), hit]
 
 
-def _ratios(groups: Any, upper: tuple[str, str], lower: tuple[str, str]) -> list[float]:
-    """The albedo error of one effect and renderer over that of another, for each seed."""
-    errors = {one["seed"]: one["albedo"] for one in groups[lower]}
-    return [one["albedo"] / errors[one["seed"]] for one in groups[upper]]
+def _knowing(groups: Any) -> list[tuple[str, str]]:
+    """Effects with the renderers that know them."""
+    return [pair for pair in groups if "lambert" not in pair[1:] and pair[0] != "none"]
+
+
+def _compared(groups: Any, effect: str, name: str) -> list[str]:
+    """Normals of a renderer and of ``lambert``; ratios of albedo errors with the effect and without."""
+    normals = (spread([one["normal_deg"] for one in groups[effect, own]], 1) for own in (name, "lambert"))
+    pairs = (((where, name), (where, "lambert")) for where in (effect, "none"))
+    return [*normals, *(spread(_ratios(groups, *pair), 2) if pair[0] in groups else "" for pair in pairs)]
+
+
+def _ratios(
+    groups: Any, upper: tuple[str, str], lower: tuple[str, str], score: str = "albedo"
+) -> list[float]:
+    """An error of one effect and renderer over that of another, for each seed."""
+    errors = {one["seed"]: one[score] for one in groups[lower]}
+    return [one[score] / errors[one["seed"]] for one in groups[upper]]
 
 
 def _trained(result: Any) -> dict[tuple[str, str], list[Any]]:
