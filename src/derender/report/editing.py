@@ -67,7 +67,7 @@ class WrittenImages:
 
     def notes(self) -> list[str]:
         """Lines for a person: what was left out, what is out-of-distribution, what was cropped."""
-        lines = [f"left out {path}: {reason}" for path, reason in self.refused.items()]
+        lines = [f"left out {path}: {why.removeprefix(path).lstrip()}" for path, why in self.refused.items()]
         if (more := len(lines) - NAMED) > 0:
             lines[NAMED:] = [f"and {more:,} more (--json names all)"]
         if self.before:
