@@ -59,13 +59,14 @@ def test_what_does_not_suit_the_model_is_drawn_only_with_force(photos, tmp_path,
     blank = tmp_path / "blank.png"
     Image.new("RGB", (200, 200), "grey").save(blank)
     line = refused("relight", "-m", KNOWN, blank, "-o", tmp_path / "blank.jpg")
-    assert "blank.png: no face is found" in line and "--force draws it anyway" in line
+    assert "blank.png: no face is found" in line and "--force draws all" in line
     assert not (tmp_path / "blank.jpg").exists()
     both = ("decompose", "-m", KNOWN, tmp_path, "-o", tmp_path / "out")
     Image.open(photos / "near.png").save(tmp_path / "near.png")
     result, printed = numbers(*both)
     assert [Path(one["picture"]).name for one in result["pictures"]] == ["near.png"]
-    assert "no face is found" in result["refused"][str(blank)] and "left out" in printed
+    assert result["refused"] == {str(blank): "no face is found"}
+    assert "left out" in printed and printed.count("--force draws all") == 1
     result, printed = numbers(*both, "--force")
     assert len(result["pictures"]) == 2 and result["framing"][str(blank)]["doubt"] == "no face is found"
     assert "drawn all the same: 1 image" in printed and not result["refused"]

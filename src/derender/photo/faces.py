@@ -141,7 +141,7 @@ def _checked(photo: UInt8[np.ndarray, "h w 3"], face: Face) -> Face:
     if result is None:
         return replace(face, rejected="not found again where it is cut out upright")
     if result.confidence < CONFIDENT:
-        return replace(result, rejected=f"confidence {result.confidence:.2f} is below {CONFIDENT}")
+        return replace(result, rejected=f"confidence {result.confidence:.3f} is below {CONFIDENT}")
     again = [result, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
     return replace(result, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
 

@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
 from derender.photo import edit_video, is_video
+from derender.photo.faces import TEMPLATES
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
-from derender.report.opening import ImageOpener, OpenedImage, Read, image_files, readable
+from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
 from derender.storage.atomic import atomic_file, atomic_folder
@@ -64,12 +66,15 @@ class WrittenImages:
     framing: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unlike: str = ""  # how images differ from those the model was validated on (``held_out_errors.unlike``)
     before: int = 0  # number of images that were left out, for their folders were there
+    help: str = ""  # what to do with those that do not suit the model
 
     def notes(self) -> list[str]:
         """Lines for a person: what was left out, what is out-of-distribution, what was cropped."""
         lines = [f"left out {path}: {why.removeprefix(path).lstrip()}" for path, why in self.refused.items()]
         if (more := len(lines) - NAMED) > 0:
             lines[NAMED:] = [f"and {more:,} more (--json names all)"]
+        if self.help:
+            lines.append(f"for those that do not suit the model: {self.help}")
         if self.before:
             lines.append(f"{self.before:,} done before")
         if self.percentiles and not self.unlike:
@@ -145,11 +150,12 @@ def write_images(
     images_only = [file for file in files if file not in moving]
     needed = not moving and not done
     read, refused = readable(images_only, opener.read, progress, needed)
-    if not force and (unsuitable := _unsuitable(read)):
-        refused |= unsuitable
-        read = {path: one for path, one in read.items() if str(path) not in unsuitable}
-        if needed and not read:
-            raise ValueError(": ".join(next(iter(unsuitable.items()))))
+    doubts = {} if force else {path: one[2]["doubt"] for path, one in read.items() if "doubt" in one[2]}
+    help = _help(np.stack([read.pop(path)[0] for path in doubts])) if doubts else ""
+    refused |= {str(path): doubt for path, doubt in doubts.items()}
+    if doubts and needed and not read:
+        path, doubt = next(iter(doubts.items()))
+        raise ValueError(f"{path}: {doubt}; {help}")
     shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
     shown = {file: row for file, row in shown.items() if not is_video(file)}
     with_sheet = len(shown) > 1 if sheet is None else sheet
@@ -198,7 +204,7 @@ def write_images(
     if percentiles:
         odd = unlike(np.stack([one.pixels for one in every]), [one.percentile or 0 for one in every])
     before = len(places) - len(records) - len(refused)
-    return WrittenImages(out, records, files, refused, percentiles, framing, odd, before)
+    return WrittenImages(out, records, files, refused, percentiles, framing, odd, before, help)
 
 
 def write_image_file(
@@ -246,14 +252,10 @@ def _copy_single(folder: Path, temporary: Path, out: Path) -> None:
         shutil.copyfile(files[0], temporary)
 
 
-def _unsuitable(read: Mapping[Path, Read]) -> dict[str, str]:
-    """Why images do not suit the model, by path, with the bundled one that fits better."""
-    doubts = {path: framing["doubt"] for path, (_, _, framing, _) in read.items() if "doubt" in framing}
-    if not doubts:
-        return {}
-    better = fitting_better(np.stack([read[path][0] for path in doubts]))
-    help = "; ".join(filter(None, (better, "--frame auto looks for another part, --force draws it anyway")))
-    return {str(path): f"{doubt}; {help}" for path, doubt in doubts.items()}
+def _help(pixels: UInt8[np.ndarray, "n 3 s s"]) -> str:
+    """What to do with images that do not suit a model of faces."""
+    how = "--frame auto looks for another part, --force draws all"
+    return "; ".join(filter(None, (fitting_better(pixels, TEMPLATES), how)))
 
 
 @contextmanager

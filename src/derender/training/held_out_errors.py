@@ -5,7 +5,7 @@ JSON file. An image with a high percentile shows another kind of object or anoth
 one proves nothing: a plain surface may be easy to render whatever it shows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -97,10 +97,10 @@ def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     return "; ".join(filter(None, (line, fitting_better(images[odd]))))
 
 
-def fitting_better(images: Images) -> str:
-    """The bundled model that reconstructs images best, with how well; empty where none does."""
+def fitting_better(images: Images, besides: Collection[str] = ()) -> str:
+    """The bundled model, ``besides`` some, that reconstructs images best; empty where none does it well."""
     results = []
-    for name in bundled_models():
+    for name in set(bundled_models()).difference(besides):
         known, model = read_errors(model_folder(name)), load(name)
         if known is not None and model.image_size == images.shape[-1]:
             results.append((float(np.median(reconstruction_percentile(model, images, known))), name))
