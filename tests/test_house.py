@@ -18,7 +18,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (7_225, 30),
     "evaluation": (7_300, 32),
-    "report": (4_125, 25),  # images that do not suit a model are left out
+    "report": (4_140, 25),  # images that do not suit a model are left out
     "cli": (2_325, 32),  # the same
     "training": (3_360, 17),  # CUDA graphs; the model that fits better
     "baselines": (2_465, 11),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_285, 238)  # on the way to (37_000, 270)
+TOTAL = (39_300, 238)  # on the way to (37_000, 270)
 TEST_LINES = 26_065
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

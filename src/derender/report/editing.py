@@ -150,7 +150,7 @@ def write_images(
     images_only = [file for file in files if file not in moving]
     needed = not moving and not done
     read, refused = readable(images_only, opener.read, progress, needed)
-    doubts = {} if force else {path: one[2]["doubt"] for path, one in read.items() if "doubt" in one[2]}
+    doubts = {} if force else opener.unsuitable(read)
     help = _help(np.stack([read.pop(path)[0] for path in doubts])) if doubts else ""
     refused |= {str(path): doubt for path, doubt in doubts.items()}
     if doubts and needed and not read:

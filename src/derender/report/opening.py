@@ -29,6 +29,9 @@ from derender.storage.atomic import DamageNoticed
 from derender.storage.places import model_folder
 from derender.training.held_out_errors import HeldOutErrors, read_errors, reconstruction_percentile
 
+UNSUITABLE_PERCENTILE = 95.0
+"""Up to it an image is drawn in which no face is found: most generated heads are, few other objects."""
+
 T = TypeVar("T")
 Read = tuple[np.ndarray, Frame, dict[str, Any], np.ndarray]
 """Pixels (3, S, S) at the model's size, the part of the file that they show, that part as JSON has it.
@@ -115,6 +118,19 @@ class ImageOpener:
         pixels = frame.cut(photo, self.model.image_size)
         judged = middle.cut(photo, self.model.image_size) if result == "auto" else pixels
         return pixels, frame, framing, judged
+
+    def unsuitable(self, read: Mapping[Path, Read]) -> dict[Path, str]:
+        """Of images in which no face suits the model, those it reconstructs badly, too, and the reasons."""
+        doubts = {path: framing["doubt"] for path, (_, _, framing, _) in read.items() if "doubt" in framing}
+        if not doubts or self.held_out is None:
+            return doubts
+        judged = np.stack([read[path][-1] for path in doubts])
+        worse = dict(zip(doubts, reconstruction_percentile(self.model, judged, self.held_out), strict=True))
+        return {
+            path: f"{doubt}; reconstructed worse than {worse[path]:.0f} % of the validation images"
+            for path, doubt in doubts.items()
+            if worse[path] > UNSUITABLE_PERCENTILE
+        }
 
     def decomposed(self, read: Mapping[Path, Read]) -> list[OpenedImage]:
         """Every image with its scene, feed-forward or optimised, at the model's size."""
