@@ -4,17 +4,44 @@ from collections.abc import Iterator
 from statistics import fmean, stdev
 from typing import Any
 
+SCORES = {"normals": "normal_deg", "albedo": "albedo", "chromaticity": "albedo_chroma", "image": "l1"}
+NUMBERS = ("gloss_strength", "gloss_exponent", "haze_beta", "haze_airlight")
+
 
 def renderers(result: Any) -> Iterator[list[str]]:
-    """Errors of scenes optimised with the renderer of an effect, beside ``lambert``: mean, deviation."""
-    yield [
-        *("effect, renderer", "L1 / lambert's", "normals, degrees", "of lambert"),
-        *("albedo error / lambert's", "the same without the effect"),
-    ]
+    """Errors with the renderer of an effect over those with ``lambert``: mean, deviation over seeds."""
+    yield ["effect, renderer", *SCORES, "albedo without the effect"]
     groups = _trained(result)
     for effect, name in _knowing(groups):
-        reconstructed = spread(_ratios(groups, (effect, name), (effect, "lambert"), "l1"), 2)
-        yield [f"{effect}: {name}", reconstructed, *_compared(groups, effect, name)]
+        ratios = [_ratios(groups, effect, name, score) for score in SCORES.values()]
+        if ("none", name) in groups:
+            ratios.append(_ratios(groups, "none", name, "albedo"))
+        cells = [spread(one, 2) for one in ratios]
+        yield [f"{effect}: {name}", *cells, *[""] * (5 - len(cells))]
+
+
+def renderer_numbers(result: Any) -> Iterator[list[str]]:
+    """How well an effect's own numbers are predicted, where it is: mean, deviation over seeds."""
+    kinds = ("spearman", "median_error", "median_error_of_line", "median_error_of_constant")
+    yield ["number, renderer", "rank correlation", "median error", "after the best line", "of a constant"]
+    groups = _trained(result)
+    for number in NUMBERS:
+        for pair in _knowing(groups):
+            if f"{number}_spearman" in (cells := groups[pair])[0]:
+                shown = (spread([one[f"{number}_{kind}"] for one in cells], 2) for kind in kinds)
+                yield [f"{number}: {pair[1]}", *shown]
+
+
+def renderers_yale(result: Any) -> Iterator[list[str]]:
+    """Residual inside the mask by the angle of the light; correlation and mean error of its angles."""
+    yield ["renderer", "up to 25°", "up to 50°", "up to 77°", "azimuth", "elevation"]
+    for one in result["cells"]:
+        residuals = (f"{one[f'residual_{band}']:.4f}" for band in ("0_25", "25_50", "50_78"))
+        angles = (
+            f"r {one[f'{kind}_correlation']:.2f}, {one[f'{kind}_mean_error_deg']:.1f}°"
+            for kind in ("azimuth", "elevation")
+        )
+        yield [one["renderer"], *residuals, *angles]
 
 
 def renderer_speed(result: Any) -> Iterator[list[str]]:
@@ -24,37 +51,15 @@ def renderer_speed(result: Any) -> Iterator[list[str]]:
         yield [one["renderer"], *(f"{one[key]:.{digits}f}" for key, digits in cells)]
 
 
-def renderers_trained(result: Any) -> Iterator[list[str]]:
-    """Errors of models trained with the renderer of an effect, beside ``lambert``: mean, deviation."""
-    yield [
-        "effect, renderer",
-        *("normals, degrees", "of lambert"),
-        *("albedo error / lambert's", "the same without the effect", "lambert's with / without the effect"),
-    ]
-    groups = _trained(result)
-    for effect, name in _knowing(groups):
-        hit = spread(_ratios(groups, (effect, "lambert"), ("none", "lambert")), 2)
-        yield [f"{effect}: {name}", *_compared(groups, effect, name), hit]
-
-
 def _knowing(groups: Any) -> list[tuple[str, str]]:
     """Effects with the renderers that know them."""
     return [pair for pair in groups if "lambert" not in pair[1:] and pair[0] != "none"]
 
 
-def _compared(groups: Any, effect: str, name: str) -> list[str]:
-    """Normals of a renderer and of ``lambert``; ratios of albedo errors with the effect and without."""
-    normals = (spread([one["normal_deg"] for one in groups[effect, own]], 1) for own in (name, "lambert"))
-    pairs = (((where, name), (where, "lambert")) for where in (effect, "none"))
-    return [*normals, *(spread(_ratios(groups, *pair), 2) if pair[0] in groups else "" for pair in pairs)]
-
-
-def _ratios(
-    groups: Any, upper: tuple[str, str], lower: tuple[str, str], score: str = "albedo"
-) -> list[float]:
-    """An error of one effect and renderer over that of another, for each seed."""
-    errors = {one["seed"]: one[score] for one in groups[lower]}
-    return [one[score] / errors[one["seed"]] for one in groups[upper]]
+def _ratios(groups: Any, effect: str, name: str, score: str) -> list[float]:
+    """An error of a renderer over that of ``lambert``, for each seed."""
+    errors = {one["seed"]: one[score] for one in groups[effect, "lambert"]}
+    return [one[score] / errors[one["seed"]] for one in groups[effect, name]]
 
 
 def _trained(result: Any) -> dict[tuple[str, str], list[Any]]:
