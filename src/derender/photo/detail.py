@@ -242,11 +242,12 @@ class PhotoDetail:
         edge = spread * (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
         result = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
-        return result.clamp(min=0)
+        return result.clamp(0, 1)
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
-        photo = _look_up(self.on_grid(self.photo[None] + self._lost, self.grid), self._place - self.reach)
+        photo = self.on_grid(self.photo[None], self.grid) + self.on_grid(self._lost, self.grid)
+        photo = _look_up(photo, self._place - self.reach)
         bare = (_cleared(photo, self._veil) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
         inner = self._seen * self._around(-COLOUR_MARGIN - FEATHER_SHARE, -COLOUR_MARGIN)
         weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)

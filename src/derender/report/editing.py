@@ -132,7 +132,8 @@ def write_images(
 
     Raises:
         FileExistsError: something would be replaced, and ``force`` is off.
-        ValueError: no image can be read, the edit is impossible, or another process writes to ``out``.
+        ValueError: no image can be read or suits the model, the edit is impossible, or another process writes
+            to ``out``.
     """
     files = image_files(paths, out)
     places, kept = _places(files, out), out / ROWS
