@@ -8,6 +8,7 @@ import derender
 from derender.data.synthetic import faces
 from derender.evaluation.disentanglement.swap import swap_test
 from derender.features.extract import model_fingerprint
+from derender.interpretation.attribution import saliency
 from derender.postprocess import Features
 from derender.postprocess.embedding import HISTOGRAMS
 from derender.postprocess.fitting import Fitting, FittingSettings, MorphableMaps, coordinates_of
@@ -176,3 +177,34 @@ def test_gradients_beside_activations_are_kept_with_the_model(tmp_path, monkeypa
     blank[own:] = 0
     model.whitening.get_buffer("albedo_map").copy_(blank)
     assert not torch.allclose(model.embed(pixels)["albedo"], expected["albedo"], atol=1e-3)
+
+
+def test_the_canonical_view_of_turned_heads_differs_less_than_they_do(plain, images):
+    scene = plain.decompose(images[:16].float() / 255)
+    turned = [scene.camera + torch.tensor([0, side * 0.25, 0, 0, 0, 0]) for side in (-1, 1)]
+    shown = [plain.render(scene.with_parameters(camera=camera)).image for camera in turned]
+    frontal = [plain.canonical_view(one) for one in shown]
+    apart, left = ((one - other)[..., 16:-16, 16:-16].abs().mean() for one, other in (shown, frontal))
+    assert left < 0.6 * apart
+
+
+def test_activations_of_the_canonical_view_are_kept_with_the_model(plain, images, tmp_path):
+    settings = WhiteningSettings(pictures=24, views=2, directions=8, photographs=True, canonical=True)
+    model, pixels = whitened(plain, images[:24], settings), images[:6].float() / 255
+    own = plain.factor_activations("geometry", pixels)
+    assert model.whitening.size("geometry") == 2 * own.shape[1]
+    assert model.whitening.size("albedo") == own.shape[1]
+    first, second, *mirrored = model.factor_activations("geometry", pixels).chunk(4, dim=1)
+    torch.testing.assert_close(first, own)
+    torch.testing.assert_close(second, plain.factor_activations("geometry", plain.canonical_view(pixels)))
+    assert len(mirrored) == 2 and not torch.allclose(mirrored[0], first, atol=0.01)
+    model.save(tmp_path / "model")
+    again = derender.load(tmp_path / "model")
+    for name, value in model.embed(pixels).items():
+        torch.testing.assert_close(again.embed(pixels)[name], value)
+    maps = [saliency(method, model, pixels, "geometry") for method in ("grad-cam", "pixels")]
+    assert [one.shape for one in maps] == [(6, 4, 4), (6, 64, 64)] and all(one.amax() > 0 for one in maps)
+    assert (
+        whitened(plain, images[:24], settings.model_copy(update={"spatial": False})).whitening.canonical
+        == set()
+    )

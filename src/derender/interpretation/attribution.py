@@ -131,18 +131,21 @@ def _at_features(
 ) -> tuple[Float[Tensor, "m c y x"], Float[Tensor, "m c y x"]]:
     """The last spatial features of an encoder, and the gradient of the answer there.
 
-    Where the feature is made of images and their mirror images, those of the mirror images follow.
+    Where the feature is made of images and their mirror images, those of the mirror images follow. What it
+    takes from the canonical view lies elsewhere and is left out.
     """
     seen: list[Tensor] = []
+    canonical = model.canonical_view(images) if model.features.turns(factor) else None
     with torch.enable_grad():
         hook = model.nets[factor].encoder.to_code.register_forward_pre_hook(
             lambda _, inputs: seen.append(inputs[0].requires_grad_())
         )
         try:
-            active = model.factor_activations(factor, images)
+            active = model.factor_activations(factor, images, canonical=canonical)
         finally:
             hook.remove()
         answer = score(model.features_from({factor: active})[factor], weight).sum()
+        seen = seen if canonical is None else seen[::2]
         gradients = torch.autograd.grad(answer, seen)
     return torch.cat(seen).detach(), torch.cat(gradients)
 

@@ -24,7 +24,7 @@ from derender.networks.encoders import reduced
 from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
 from derender.postprocess.whitening import Whitening
 from derender.presets import ModelSettings
-from derender.render import Rendering
+from derender.render import Rendering, unwarp
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior
 from derender.scene.camera import constant
@@ -58,6 +58,10 @@ class Features:
     def mirrors(self, factor: str) -> bool:
         """Whether a factor's feature is made of an image and of its mirror image."""
         return self.whitening is not None and factor in self.whitening.mirrored
+
+    def turns(self, factor: str) -> bool:
+        """Whether a factor's feature is made of an image and of its canonical view."""
+        return self.whitening is not None and factor in self.whitening.canonical
 
     def __call__(
         self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]
@@ -195,21 +199,38 @@ class EmbeddingModel(nn.Module):
         return result
 
     def factor_activations(
-        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None
-    ) -> Float[Tensor, "n _"]:
+        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None,
+        canonical: Float[Tensor, "n 3 h w"] | None = None,
+    ) -> Float[Tensor, "n _"]:  # fmt: skip
         """``activations`` for one factor, without coordinates.
 
-        ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default where
-        ``features`` take them.
+        Args:
+            gradients: followed by `gradient_directions` and `gradient_histograms`; by default where
+                ``features`` take them.
+            canonical: followed by activations of these, the images' ``canonical_view``; by default where
+                ``features`` take them.
         """
-        parts, images = [], reduced(images, self.settings.network)
-        for one in (images, images.flip(-1)) if self.features.mirrors(name) else (images,):
-            parts.append(self.nets[name].activations(one))  # type: ignore[operator]
+        if canonical is None and self.features.turns(name):
+            canonical = self.canonical_view(images)
+        shown = [reduced(one, self.settings.network) for one in (images, canonical) if one is not None]
+        parts = []
+        for flips in (False, True) if self.features.mirrors(name) else (False,):
+            seen = [one.flip(-1) if flips else one for one in shown]
+            parts += [self.nets[name].activations(one) for one in seen]  # type: ignore[operator]
             if self.whitening is not None and name in self.whitening.names and gradients is None:
-                gradients = self.whitening.size(name) > parts[0].shape[1]
+                gradients = len(seen) == 1 and self.whitening.size(name) > parts[0].shape[1]
             if gradients:
-                parts += [gradient_directions(one), gradient_histograms(one)]
+                parts += [gradient_directions(seen[0]), gradient_histograms(seen[0])]
         return torch.cat(parts, dim=1)
+
+    def canonical_view(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+        """The images' own pixels on the decomposed surface, seen from the front (`unwarp`)."""
+        ranges, seen, values = self.settings.ranges, reduced(images, self.settings.network), {}
+        for row in self.factors:
+            if row.parameter in ("depth", "camera"):
+                net: Any = self.nets[row.name]
+                values[row.parameter] = row.to_parameter(net.decoder(net.encoder(seen)), ranges)
+        return unwarp(images, **values, fov_deg=ranges.fov_deg)
 
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that activations begin with: ``encode`` of the same images."""

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from derender.storage.tensors import read_tensors, write_tensors
 
 _MIRRORED = "reads_mirror_image"  # in a file: maps take images with their mirror images
+_CANONICAL = "_canonical"  # after a factor's name: its map takes the image in the canonical view, too
 _ALONE = "_alone"  # after a factor's name, beside the former: this one takes images alone
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
 _TINY = torch.finfo(torch.float32).tiny
@@ -130,14 +131,20 @@ class Whitening(nn.Module):
     """The projections of some factors, applied to activations by name; gives those factors' features alone.
 
     A projection takes the first of the activations, as many as it has rows. Those of names in ``mirrored``
-    take the mean over an image and its mirror image, whose activations follow.
+    take the mean over an image and its mirror image, whose activations follow. Names in ``canonical``
+    take activations of the image, then of its canonical view.
     """
 
-    def __init__(self, projections: Mapping[str, Projection], *, mirrored: Collection[str] = ()):
+    def __init__(
+        self, projections: Mapping[str, Projection], *, mirrored: Collection[str] = (),
+        canonical: Collection[str] = (),
+    ):  # fmt: skip
         super().__init__()
         self.names = tuple(projections)
         self.mirrored = frozenset(mirrored) & frozenset(projections)
+        self.canonical = frozenset(canonical) & frozenset(projections)
         tensors = {_MIRRORED: torch.ones(1)} if self.mirrored else {}
+        tensors |= {f"{name}{_CANONICAL}": torch.ones(1) for name in self.canonical}
         for name, own in projections.items():
             if self.mirrored and name not in self.mirrored:
                 tensors[f"{name}{_ALONE}"] = torch.ones(1)
@@ -175,7 +182,7 @@ class Whitening(nn.Module):
         maps, ratios = ([self.get_buffer(f"{n}_{part}") for n in self.names] for part in ("map", "ratios"))
         rows = zip(self.names, maps, ratios, strict=True)
         projections = {name: Projection(means[name].float(), own, ratio) for name, own, ratio in rows}
-        return Whitening(projections, mirrored=self.mirrored)
+        return Whitening(projections, mirrored=self.mirrored, canonical=self.canonical)
 
     def save(self, file: Path) -> None:
         """Write the projections; complete or not at all."""
@@ -201,4 +208,5 @@ class Whitening(nn.Module):
                 raise ValueError(f"{name}: a map of {tuple(chart.shape)} beside a mean of {len(mean)}")
             projections[name] = Projection(mean, chart, ratios)
         alone = {name for name in projections if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
-        return cls(projections, mirrored=projections.keys() - alone)
+        canonical = {name for name in projections if f"{name}{_CANONICAL}" in tensors}
+        return cls(projections, mirrored=projections.keys() - alone, canonical=canonical)

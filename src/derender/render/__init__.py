@@ -12,12 +12,23 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from derender.render import shading, warping
 from derender.render.backends import available_backends, chosen_backend
+from derender.scene.camera import constant, project, to_camera, unproject
 from derender.scene.scene import Scene
 
-__all__ = ["Rendering", "available_backends", "chosen_backend", "render", "render_scene", "shade", "warp"]
+__all__ = [
+    "Rendering",
+    "available_backends",
+    "chosen_backend",
+    "render",
+    "render_scene",
+    "shade",
+    "unwarp",
+    "warp",
+]
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,20 @@ def warp(
     depth, image, camera = _checked(depth, image=(image, channels), camera=(camera, 6))
     with torch.autocast(depth.device.type, enabled=False):
         return Rendering(*warping.warp(image, depth, camera, fov_deg, backend))
+
+
+def unwarp(
+    image: Float[Tensor, "n c h w"], depth: Float[Tensor, "n h w"], camera: Float[Tensor, "n 6"],
+    fov_deg: float = 10.0,
+) -> Float[Tensor, "n c h w"]:  # fmt: skip
+    """What each canonical pixel shows in an image that ``camera`` took of its surface: undoes `warp`.
+
+    A point that something hides takes the colour in front of it, one outside the image that of its border.
+    """
+    height, width = depth.shape[-2:]
+    place = project(to_camera(unproject(depth, fov_deg), camera), height, width, fov_deg)
+    grid = place * 2 / constant((width - 1.0, height - 1.0), place) - 1
+    return grid_sample(image, grid, padding_mode="border", align_corners=True)
 
 
 def _checked(depth: Tensor, **others: tuple[Tensor, int]) -> list[Tensor]:

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping
 import torch
 from jaxtyping import Float, Int64, Shaped
 from torch import Generator, Tensor
-from torch.nn.functional import grid_sample
 
 from derender.data import Progress, as_float
 from derender.model import Derenderer
@@ -23,10 +22,9 @@ from derender.postprocess import Features
 from derender.postprocess.embedding import HISTOGRAMS
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings, MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
-from derender.render import warp
+from derender.render import unwarp, warp
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior, brightness_cues
-from derender.scene.camera import constant, project, to_camera, unproject
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.scene.perturb import PerturbSettings, perturb_camera
@@ -103,9 +101,15 @@ def fit_whitening(
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
     gradients = settings.gradients and settings.spatial
     described = {f.name for f in maps if gradients and f.parameter == "albedo"}
+    turns = settings.canonical and settings.spatial and "camera" in {f.parameter for f in vectors}
+    turned = {f.name for f in maps if turns and f.parameter == "depth"}
 
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
-        return {f.name: model.factor_activations(f.name, batch, f.name in described) for f in maps}
+        seen = {name: model.canonical_view(batch) for name in turned}
+        return {
+            f.name: model.factor_activations(f.name, batch, f.name in described, seen.get(f.name))
+            for f in maps
+        }
 
     encode = activated if settings.spatial else model.encode
     names = tuple(factor.name for factor in maps)
@@ -126,7 +130,8 @@ def fit_whitening(
                 _check_finite("whitening", own, start)
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
-                blocks = joined.tensor_split([-HISTOGRAMS] if name in described else [], dim=-1)
+                last = HISTOGRAMS if name in described else joined.shape[-1] // 2
+                blocks = joined.tensor_split([-last] if name in described | turned else [], dim=-1)
                 own = mirrored.setdefault(name, [Scatter() for _ in blocks])
                 for scatter, block in zip(own, blocks, strict=True):
                     scatter.add(block)
@@ -145,7 +150,8 @@ def fit_whitening(
         name: fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
         for name, scatter in alone.items()
     }
-    return Whitening(projections, mirrored=mirrored if settings.mirrored else ()).to(model.device)
+    mirrors = mirrored if settings.mirrored else ()
+    return Whitening(projections, mirrored=mirrors, canonical=turned).to(model.device)
 
 
 @torch.no_grad()
@@ -234,11 +240,9 @@ def photographs(
 
     The images' own pixels lie on the surfaces; each is multiplied by the new shading over its own.
     """
-    shown, (height, width), fov = [images], images.shape[-2:], model.fov_deg
-    place = project(to_camera(unproject(scene.depth, fov), scene.camera), height, width, fov)
-    grid = place * 2 / constant((width - 1.0, height - 1.0), place) - 1
-    texture = grid_sample(images, grid, padding_mode="border", align_corners=True)
+    shown, fov = [images], model.fov_deg
     normals = normals_from_depth(scene.depth, fov)
+    texture = unwarp(images, scene.depth, scene.camera, fov)
     texture = texture / lambert_shading(normals, scene.light).clamp(min=DARKEST)
 
     def drawn(low: float, high: float, *shape: int) -> Tensor:
