@@ -145,7 +145,7 @@ def _at_features(
         finally:
             hook.remove()
         answer = score(model.features_from({factor: active})[factor], weight).sum()
-        seen = seen if canonical is None else seen[::2]
+        seen = seen[:: len(seen) // (2 if model.features.mirrors(factor) else 1)]
         gradients = torch.autograd.grad(answer, seen)
     return torch.cat(seen).detach(), torch.cat(gradients)
 

@@ -192,7 +192,10 @@ class EmbeddingModel(nn.Module):
         `coordinates_of`.
         """
         check_images(images, self.image_size)
-        result = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
+        turned = (
+            self.canonical_view(images) if any(self.features.turns(f.name) for f in self.factors) else None
+        )
+        result = {f.name: self.factor_activations(f.name, images, canonical=turned) for f in self.factors}
         if self.features.fits_scenes:
             fitted = self._fitted(images, self.features.required_fitting().settings.steps).coordinates
             result |= {coordinates_of(name): value for name, value in fitted.items()}
@@ -207,20 +210,24 @@ class EmbeddingModel(nn.Module):
         Args:
             gradients: followed by `gradient_directions` and `gradient_histograms`; by default where
                 ``features`` take them.
-            canonical: followed by activations of these, the images' ``canonical_view``; by default where
-                ``features`` take them.
+            canonical: the images' ``canonical_view``, whose histograms follow, or activations where there
+                are none; by default where ``features`` take them.
         """
-        if canonical is None and self.features.turns(name):
+        if self.whitening is not None and not self.features.turns(name):
+            canonical = None
+        elif canonical is None and self.features.turns(name):
             canonical = self.canonical_view(images)
         shown = [reduced(one, self.settings.network) for one in (images, canonical) if one is not None]
-        parts = []
+        parts, net = list[Tensor](), dict[str, Any](self.nets)[name]
         for flips in (False, True) if self.features.mirrors(name) else (False,):
             seen = [one.flip(-1) if flips else one for one in shown]
-            parts += [self.nets[name].activations(one) for one in seen]  # type: ignore[operator]
+            parts.append(net.activations(seen[0]))
             if self.whitening is not None and name in self.whitening.names and gradients is None:
-                gradients = len(seen) == 1 and self.whitening.size(name) > parts[0].shape[1]
+                gradients = self.whitening.size(name) not in (parts[0].shape[1], 2 * parts[0].shape[1])
             if gradients:
-                parts += [gradient_directions(seen[0]), gradient_histograms(seen[0])]
+                parts += [gradient_directions(seen[0]), *map(gradient_histograms, seen)]
+            else:
+                parts += map(net.activations, seen[1:])
         return torch.cat(parts, dim=1)
 
     def canonical_view(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:

@@ -106,11 +106,13 @@ def fit_projection(
 
 
 def fit_side_by_side(
-    scatters: Sequence[Scatter], directions: int, shrinkage: float, size: int, evenness: float
-) -> Projection:
+    scatters: Sequence[Scatter], directions: int, shrinkage: float, size: int, evenness: float,
+    as_one: bool = False,
+) -> Projection:  # fmt: skip
     """One map of several activations side by side, each into its share of ``size`` features.
 
-    Arguments are as of `fit_projection`. The features of all have as much variance as those of the first.
+    Arguments are as of `fit_projection`. The features of each have as much variance as those of the first;
+    ``as_one``: all together.
     """
     sizes = [(size + place) // len(scatters) for place in range(len(scatters))]
     fitted = [
@@ -122,7 +124,8 @@ def fit_side_by_side(
         (own.T @ (one.within + one.between) @ own).trace().clamp(min=_TINY)
         for own, one in zip(maps, scatters, strict=True)
     ]
-    scaled = [own * (totals[0] / total).sqrt() for own, total in zip(maps, totals, strict=True)]
+    most = totals[0] / (len(maps) if as_one else 1)
+    scaled = [own * (most / total).sqrt() for own, total in zip(maps, totals, strict=True)]
     means, ratios = (torch.cat([getattr(own, part) for own in fitted]) for part in ("mean", "ratios"))
     return Projection(means, torch.block_diag(*scaled).float(), ratios.sort(descending=True).values)
 
