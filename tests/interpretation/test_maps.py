@@ -51,7 +51,7 @@ class Looking:
         net.encode = net.encoder.forward  # type: ignore[assignment]
         self.nets, self.features = {"geometry": net}, Features()
 
-    def factor_activations(self, name: str, images: torch.Tensor, canonical=None) -> torch.Tensor:
+    def factor_activations(self, name: str, images: torch.Tensor) -> torch.Tensor:
         encoder = self.nets[name].encoder
         return activations(encoder(images), encoder.spatial(images))
 

@@ -25,11 +25,12 @@ import torch
 from jaxtyping import Float
 from scipy.stats import rankdata
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from derender.baselines.controls import untrained_twin
 from derender.evaluation.pixels import masked_ssim
 from derender.interpretation.probe import Probe
+from derender.render import warp
 from derender.storage.places import optional, require_known
 
 OUTPUTS = ("logit", "probability")
@@ -115,7 +116,12 @@ def saliency(
         gradient = gradient.mean(dim=(2, 3), keepdim=True)
     maps = (gradient * features).sum(dim=1)
     own, mirror = maps[: len(images)], maps[len(images) :]
-    return (own + mirror.flip(-1) if len(mirror) else own).relu()
+    maps = (own + mirror.flip(-1) if len(mirror) else own).relu()
+    if not model.features.turns(factor):
+        return maps
+    depth, camera = model.surface(images)  # back from the canonical view
+    shown = warp(upsampled(maps, depth.shape[-1])[:, None], depth, camera, model.fov_deg).image
+    return adaptive_avg_pool2d(shown, maps.shape[-1])[:, 0]
 
 
 def score(code: Float[Tensor, "n c"], weight: Tensor | None) -> Float[Tensor, " n"]:
@@ -131,21 +137,20 @@ def _at_features(
 ) -> tuple[Float[Tensor, "m c y x"], Float[Tensor, "m c y x"]]:
     """The last spatial features of an encoder, and the gradient of the answer there.
 
-    Where the feature is made of images and their mirror images, those of the mirror images follow. What it
-    takes from the canonical view lies elsewhere and is left out.
+    Where the feature is made of images and their mirror images, those of the mirror images follow. Of one
+    made of the canonical view they are that view's.
     """
     seen: list[Tensor] = []
-    canonical = model.canonical_view(images) if model.features.turns(factor) else None
     with torch.enable_grad():
         hook = model.nets[factor].encoder.to_code.register_forward_pre_hook(
             lambda _, inputs: seen.append(inputs[0].requires_grad_())
         )
         try:
-            active = model.factor_activations(factor, images, canonical=canonical)
+            active = model.factor_activations(factor, images)
         finally:
             hook.remove()
         answer = score(model.features_from({factor: active})[factor], weight).sum()
-        seen = seen[:: len(seen) // (2 if model.features.mirrors(factor) else 1)]
+        seen = seen[-2 if model.features.mirrors(factor) else -1 :]  # before them the surface was decoded
         gradients = torch.autograd.grad(answer, seen)
     return torch.cat(seen).detach(), torch.cat(gradients)
 

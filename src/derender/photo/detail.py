@@ -8,10 +8,10 @@ model's albedo, moved to the photograph's colours; the three blend. Around the m
 continues into a plane through the object's centre: hair, neck and background follow and come to rest.
 New light falls on the object alone, whose outline GrabCut (Rother et al., SIGGRAPH 2004) finds by colour.
 The more shading or view change, the more the model's colours weigh, after a change of shading in their smooth
-part: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded (sRGB) values,
-as in training: on Extended Yale B that is nearer to the truth than the same ratio in linear light. Highlights
-and haze that the renderer knows are taken off and drawn anew; what they cannot explain stays. Over-exposed
-skin darkens in the colour of the skin around it.
+part: what it explained wrongly would otherwise stay in the surface. Shading multiplies coded values, as in
+training: with a display's gamma that is linear light times the ratio of linear shadings; sRGB's own curve
+gives nearly the same (lab/log.md). Highlights and haze that the renderer knows are taken off and drawn anew;
+what they cannot explain stays. Over-exposed skin darkens in the colour of the skin around it.
 """
 
 from math import atan, degrees, radians, tan

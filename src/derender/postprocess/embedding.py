@@ -60,7 +60,7 @@ class Features:
         return self.whitening is not None and factor in self.whitening.mirrored
 
     def turns(self, factor: str) -> bool:
-        """Whether a factor's feature is made of an image and of its canonical view."""
+        """Whether a factor's feature is made of the image's canonical view."""
         return self.whitening is not None and factor in self.whitening.canonical
 
     def __call__(
@@ -192,52 +192,45 @@ class EmbeddingModel(nn.Module):
         `coordinates_of`.
         """
         check_images(images, self.image_size)
-        turned = (
-            self.canonical_view(images) if any(self.features.turns(f.name) for f in self.factors) else None
-        )
-        result = {f.name: self.factor_activations(f.name, images, canonical=turned) for f in self.factors}
+        result = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
         if self.features.fits_scenes:
             fitted = self._fitted(images, self.features.required_fitting().settings.steps).coordinates
             result |= {coordinates_of(name): value for name, value in fitted.items()}
         return result
 
     def factor_activations(
-        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None,
-        canonical: Float[Tensor, "n 3 h w"] | None = None,
-    ) -> Float[Tensor, "n _"]:  # fmt: skip
+        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None
+    ) -> Float[Tensor, "n _"]:
         """``activations`` for one factor, without coordinates.
 
-        Args:
-            gradients: followed by `gradient_directions` and `gradient_histograms`; by default where
-                ``features`` take them.
-            canonical: the images' ``canonical_view``, whose histograms follow, or activations where there
-                are none; by default where ``features`` take them.
+        Where ``features`` take the canonical view, its activations follow the code. ``gradients``: followed
+        by `gradient_directions` and `gradient_histograms`; by default where ``features`` take them.
         """
-        if self.whitening is not None and not self.features.turns(name):
-            canonical = None
-        elif canonical is None and self.features.turns(name):
-            canonical = self.canonical_view(images)
-        shown = [reduced(one, self.settings.network) for one in (images, canonical) if one is not None]
-        parts, net = list[Tensor](), dict[str, Any](self.nets)[name]
-        for flips in (False, True) if self.features.mirrors(name) else (False,):
-            seen = [one.flip(-1) if flips else one for one in shown]
-            parts.append(net.activations(seen[0]))
+        net, turned, parts = dict[str, Any](self.nets)[name], self.features.turns(name), list[Tensor]()
+        shown = reduced(self.canonical_view(images) if turned else images, self.settings.network)
+        code = [net.encoder(images)] if turned else []
+        for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
+            parts += [*code, activated := net.activations(one)]
             if self.whitening is not None and name in self.whitening.names and gradients is None:
-                gradients = self.whitening.size(name) not in (parts[0].shape[1], 2 * parts[0].shape[1])
+                gradients = self.whitening.size(name) > activated.shape[1]
             if gradients:
-                parts += [gradient_directions(seen[0]), *map(gradient_histograms, seen)]
-            else:
-                parts += map(net.activations, seen[1:])
+                parts += [gradient_directions(one), gradient_histograms(one)]
         return torch.cat(parts, dim=1)
 
+    def surface(
+        self, images: Float[Tensor, "n 3 h w"]
+    ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n 6"]]:
+        """Depth and camera of images in 0..1, as ``decompose`` finds them."""
+        nets, rows = dict[str, Any](self.nets), {row.parameter: row for row in self.factors}
+        depth, camera = (
+            rows[kind].to_parameter(nets[rows[kind].name](images), self.settings.ranges)
+            for kind in ("depth", "camera")
+        )
+        return depth, camera
+
     def canonical_view(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-        """The images' own pixels on the decomposed surface, seen from the front (`unwarp`)."""
-        ranges, seen, values = self.settings.ranges, reduced(images, self.settings.network), {}
-        for row in self.factors:
-            if row.parameter in ("depth", "camera"):
-                net: Any = self.nets[row.name]
-                values[row.parameter] = row.to_parameter(net.decoder(net.encoder(seen)), ranges)
-        return unwarp(images, **values, fov_deg=ranges.fov_deg)
+        """The images' own pixels on the surface they show, seen from the front (`unwarp`)."""
+        return unwarp(images, *self.surface(images), self.settings.ranges.fov_deg)
 
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that activations begin with: ``encode`` of the same images."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from derender.storage.tensors import read_tensors, write_tensors
 
 _MIRRORED = "reads_mirror_image"  # in a file: maps take images with their mirror images
-_CANONICAL = "_canonical"  # after a factor's name: its map takes the image in the canonical view, too
+_CANONICAL = "_canonical"  # after a factor's name: its map takes the canonical view's activations
 _ALONE = "_alone"  # after a factor's name, beside the former: this one takes images alone
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
 _TINY = torch.finfo(torch.float32).tiny
@@ -106,13 +106,11 @@ def fit_projection(
 
 
 def fit_side_by_side(
-    scatters: Sequence[Scatter], directions: int, shrinkage: float, size: int, evenness: float,
-    as_one: bool = False,
-) -> Projection:  # fmt: skip
+    scatters: Sequence[Scatter], directions: int, shrinkage: float, size: int, evenness: float
+) -> Projection:
     """One map of several activations side by side, each into its share of ``size`` features.
 
-    Arguments are as of `fit_projection`. The features of each have as much variance as those of the first;
-    ``as_one``: all together.
+    Arguments are as of `fit_projection`. The features of all have as much variance as those of the first.
     """
     sizes = [(size + place) // len(scatters) for place in range(len(scatters))]
     fitted = [
@@ -124,8 +122,7 @@ def fit_side_by_side(
         (own.T @ (one.within + one.between) @ own).trace().clamp(min=_TINY)
         for own, one in zip(maps, scatters, strict=True)
     ]
-    most = totals[0] / (len(maps) if as_one else 1)
-    scaled = [own * (most / total).sqrt() for own, total in zip(maps, totals, strict=True)]
+    scaled = [own * (totals[0] / total).sqrt() for own, total in zip(maps, totals, strict=True)]
     means, ratios = (torch.cat([getattr(own, part) for own in fitted]) for part in ("mean", "ratios"))
     return Projection(means, torch.block_diag(*scaled).float(), ratios.sort(descending=True).values)
 
@@ -133,9 +130,9 @@ def fit_side_by_side(
 class Whitening(nn.Module):
     """The projections of some factors, applied to activations by name; gives those factors' features alone.
 
-    A projection takes the first of the activations, as many as it has rows. Those of names in ``mirrored``
-    take the mean over an image and its mirror image, whose activations follow. Names in ``canonical``
-    take activations of the image, then of its canonical view.
+    A projection takes the first of the activations, as many as it has rows; of names in ``canonical`` the
+    last, which are of the image's canonical view. Those of names in ``mirrored`` take the mean over an image
+    and its mirror image, whose activations follow.
     """
 
     def __init__(
@@ -178,7 +175,7 @@ class Whitening(nn.Module):
             )
         if mirrored:
             activations = activations.unflatten(1, (2, -1)).mean(dim=1)
-        return activations[:, :size].float()
+        return (activations[:, -size:] if name in self.canonical else activations[:, :size]).float()
 
     def with_means(self, means: Mapping[str, Float[Tensor, " input"]]) -> "Whitening":
         """The same maps about other means of ``inputs``, by name; distances stay as they are."""

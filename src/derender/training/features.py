@@ -102,19 +102,14 @@ def fit_whitening(
     gradients = settings.gradients and settings.spatial
     described = {f.name for f in maps if gradients and f.parameter == "albedo"}
     turns = settings.canonical and settings.spatial and "camera" in {f.parameter for f in vectors}
-    turned = {f.name for f in maps if turns and (f.parameter == "depth" or f.name in described)}
+    turned = {f.name for f in maps if turns and f.parameter == "depth"}
 
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
         seen = dict.fromkeys(turned, model.canonical_view(batch)) if turned else {}
         return {
-            f.name: model.factor_activations(f.name, batch, f.name in described, seen.get(f.name))
+            f.name: model.factor_activations(f.name, seen.get(f.name, batch), f.name in described)
             for f in maps
         }
-
-    def blocks(name: str, activations: Float[Tensor, "views n _"]) -> tuple[Tensor, ...]:
-        width = HISTOGRAMS if name in described else activations.shape[-1] // 2
-        count = (name in described) + (name in turned)
-        return activations.tensor_split([-width * place for place in range(count, 0, -1)], dim=-1)
 
     encode = activated if settings.spatial else model.encode
     names = tuple(factor.name for factor in maps)
@@ -135,9 +130,9 @@ def fit_whitening(
                 _check_finite("whitening", own, start)
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
-                parts = blocks(name, joined)
-                own = mirrored.setdefault(name, [Scatter() for _ in parts])
-                for scatter, block in zip(own, parts, strict=True):
+                blocks = joined.tensor_split([-HISTOGRAMS] if name in described else [], dim=-1)
+                own = mirrored.setdefault(name, [Scatter() for _ in blocks])
+                for scatter, block in zip(own, blocks, strict=True):
                     scatter.add(block)
             exchangeable = len(batch) > 1 and settings.vectors
             for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
@@ -148,9 +143,7 @@ def fit_whitening(
     size = size or model.settings.network.code_size
     shrinkage, power = settings.shrinkage, settings.vector_power
     projections = {
-        name: fit_side_by_side(
-            own, settings.directions, shrinkage, size, settings.evenness, as_one=name not in described
-        )
+        name: fit_side_by_side(own, settings.directions, shrinkage, size, settings.evenness)
         for name, own in mirrored.items()
     } | {
         name: fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
