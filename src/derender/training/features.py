@@ -10,6 +10,7 @@ Fitting: a morphable model of the predicted depths and albedos, within which pos
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int64, Shaped
@@ -37,6 +38,7 @@ BRIGHTNESS_IMAGES = 8000
 LIGHT_DEG = (60.0, 80.0)  # of photographs: how far pitch and yaw of their light go
 TURNS = PerturbSettings(camera_pitch_deg=6, camera_yaw_deg=12)  # of photographs
 GREY = 0.4  # share of photographs without colour
+TURNED_SHARE = 0.5  # of its variance, kept by geometry of the canonical view: its camera errs in strong light
 DARKEST = 0.1  # shading by which an image is divided, at least
 LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinates, where features hold them
 
@@ -149,6 +151,8 @@ def fit_whitening(
         name: fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
         for name, scatter in alone.items()
     }
+    for name in turned:
+        projections[name] = replace(projections[name], map=projections[name].map * TURNED_SHARE**0.5)
     mirrors = mirrored if settings.mirrored else ()
     return Whitening(projections, mirrored=mirrors, canonical=turned).to(model.device)
 
