@@ -130,8 +130,8 @@ def fit_side_by_side(
 class Whitening(nn.Module):
     """The projections of some factors, applied to activations by name; gives those factors' features alone.
 
-    A projection takes the first of the activations, as many as it has rows; of names in ``canonical`` the
-    last, which are of the image's canonical view. Those of names in ``mirrored`` take the mean over an image
+    A projection takes the first of the activations, as many as it has rows. Those of names in ``canonical``
+    take the last, of the image's canonical view. Those of names in ``mirrored`` take the mean over an image
     and its mirror image, whose activations follow.
     """
 
