@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (665, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_370, 238)  # on the way to (37_000, 270)
+TOTAL = (39_371, 238)  # on the way to (37_000, 270)
 TEST_LINES = 26_110
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -228,8 +228,9 @@ class EmbeddingModel(nn.Module):
         )
         return depth, camera
 
-    def canonical_view(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-        """The images' own pixels on the surface they show, seen from the front (`unwarp`)."""
+    def canonical_view(self, images: GivenImages) -> Float[Tensor, "n 3 h w"]:
+        """The images' own pixels on their surface, seen from the front (`unwarp`); images as for `embed`."""
+        images = as_batch(images, self.image_size, next(self.parameters()).device)
         return unwarp(images, *self.surface(images), self.settings.ranges.fov_deg)
 
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
