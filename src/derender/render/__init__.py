@@ -89,6 +89,7 @@ def unwarp(
     """What each canonical pixel shows in an image that ``camera`` took of its surface: undoes `warp`.
 
     A point that something hides takes the colour in front of it, one outside the image that of its border.
+    Conventions as in `render`; the image may have another size than ``depth``: outermost pixels coincide.
     """
     height, width = depth.shape[-2:]
     place = project(to_camera(unproject(depth, fov_deg), camera), height, width, fov_deg)

@@ -14,13 +14,11 @@ from dataclasses import dataclass, field, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from derender.networks import FACTORS, Factor
-from derender.render import Rendering, shade, warp
+from derender.render import Rendering, shade, unwarp, warp
 from derender.render.shading import shade as lambert
 from derender.scene import Scene
-from derender.scene.camera import project, to_camera, unproject
 from derender.scene.normals import normals_from_depth
 
 STAGES = ("visibility", "irradiance", "specular", "atmosphere")
@@ -99,12 +97,10 @@ class Renderer:
             return scene.depth[:, None][:, :0]
         shine = self.shade(scene, fov_deg) - scene.albedo * self.shading(scene, fov_deg)
         air = self.atmosphere or (lambda rendering, _: rendering)
-        view, size = warp(0 * shine, scene.depth, scene.camera, fov_deg), scene.depth.shape[1:]
+        view = warp(0 * shine, scene.depth, scene.camera, fov_deg)
         black, white = (air(replace(view, image=view.image + one), scene).image for one in (0, 1))
-        place = project(to_camera(unproject(scene.depth, fov_deg), scene.camera), size[0], size[1], fov_deg)
-        grid = place * 2 / (place.new_tensor([size[1], size[0]]) - 1) - 1
         through = torch.cat([black, (white - black).mean(dim=1, keepdim=True)], dim=1)
-        own, kept = grid_sample(through, grid, padding_mode="border", align_corners=True).split((3, 1), dim=1)
+        own, kept = unwarp(through, scene.depth, scene.camera, fov_deg).split((3, 1), dim=1)
         return torch.cat([1 - kept, shine * kept + own], dim=1)
 
     def _light(self, scene: Scene, fov_deg: float, visible: Tensor | None, backend: str = "auto") -> Tensor:

@@ -2,9 +2,10 @@
 
 Whitening: how other factors move a model's activations, measured on its own renderings. For geometry and
 albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times. Mirror images count as views, too, for the object is symmetric. For each vector
-factor everything but that factor is changed: maps are another image's. Leaves out changing one map beside the
-other, which brought nothing (lab/log.md). Brightness: the prior that shares it between albedo and light.
+encoded again, several times. Geometry is encoded from the canonical view where the settings say so. Mirror
+images count as views, too, for the object is symmetric. For each vector factor everything but that factor is
+changed: maps are another image's. Leaves out changing one map beside the other, which brought nothing
+(lab/log.md). Brightness: the prior that shares it between albedo and light.
 Fitting: a morphable model of the predicted depths and albedos, within which postprocess/fitting.py optimises.
 """
 
