@@ -20,7 +20,7 @@ BUDGET = {  # lines, files
     "evaluation": (7_300, 32),
     "report": (4_140, 25),  # images that do not suit a model are left out
     "cli": (2_325, 32),  # the same
-    "training": (3_368, 17),  # CUDA graphs; the model that fits better; features of the canonical view
+    "training": (3_459, 18),  # CUDA graphs; networks compiled if asked; features of the canonical view
     "baselines": (2_465, 11),
     "render": (1_710, 15),  # unwarp
     "features": (1_310, 8),  # a folder is refused before images are embedded
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (660, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_369, 238)  # on the way to (37_000, 270)
-TEST_LINES = 26_110
+TOTAL = (39_460, 239)  # on the way to (37_000, 270)
+TEST_LINES = 26_203
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -32,7 +32,8 @@ class TrainState:
     """Counters of a run; with the weights and the optimiser they determine everything that follows.
 
     ``images`` and ``seconds`` count the run so far. The lowest validation loss is None before the first
-    validation; then come the number of validations since, and the state of the collapse detector.
+    validation; then come the number of validations since, and the state of the collapse detector. Whether
+    networks are compiled is None where that was never asked for.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
@@ -42,6 +43,7 @@ class TrainState:
     best_loss: Annotated[float, Field(allow_inf_nan=False)] | None = None
     validations_since_best: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     watcher: dict[str, Any] = field(default_factory=dict)
+    compiled: bool | None = None
 
     def ended_by(self, config: Any) -> str | None:
         """The setting that lets a run with these counters train no further, if there is one."""

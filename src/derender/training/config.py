@@ -128,11 +128,12 @@ class LoopSettings(Settings):
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
     channels_last: bool = True  # memory layout of networks: speed only
     cuda_graph: Literal["auto", "off"] = "auto"  # on a GPU: replay recorded steps where that is faster
+    compile: Literal["auto", "off"] = "off"  # auto: torch.compile networks where that makes steps faster
     deterministic: bool = False  # repeat a run bit for bit, slower
     watch: bool = True  # look for collapse and return to the last good checkpoint
     seed: int = 0
 
-    @field_validator("cuda_graph", mode="before")
+    @field_validator("cuda_graph", "compile", mode="before")
     @classmethod
     def _off(cls, value: Any) -> Any:
         return "off" if value is False else value  # as YAML reads the word

@@ -9,6 +9,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from functools import partial
 from itertools import count, groupby, takewhile
 from math import isfinite
 from pathlib import Path
@@ -24,6 +25,7 @@ from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.storage.folder import SplitRecord, write_split
 from derender.training import checkpoint, process, run_folder
 from derender.training.batches import Reader, batches_of, random_stream
+from derender.training.compiled import compile_networks
 from derender.training.cuda_graph import Replayed
 from derender.training.distributed import open_fabric, ranks_of
 from derender.training.task import (
@@ -114,6 +116,7 @@ class _Run:
         self.replayed = None
         if self.noise is not None and ranks.count == 1 and config.cuda_graph == "auto":
             self.replayed = Replayed(self.update, self.noise, self.note)
+        self.uncompiled = config.compile == "auto" and ranks.count == 1 and not config.deterministic
         self.model_images: int | None = None
         self.writer: "SummaryWriter | None" = None
         if ranks.first:
@@ -190,14 +193,26 @@ class _Run:
         if self.noise is not None:
             self.noise.manual_seed(drawn.initial_seed())
         images = self.reader.at(position)
+        rows = self.train_rows[self.reader.batches.order(position, self.ranks)]
+        if self.uncompiled:
+            self.uncompiled = False
+            trial = partial(self.trial, images, done, rows)
+            state.compiled = compile_networks(self.model, trial, self.note, state.compiled)
         if self.replayed is not None:
             (result, gradients, stages), note = self.replayed(images, done, self.task.phase(done))
         else:
-            rows = self.train_rows[self.reader.batches.order(position, self.ranks)]
             (result, gradients, stages), note = self.update(images, done, self.noise or drawn, rows)
         state.images += config.batch_size
         self.notes.append((state.images, gradients, stages, note))
         return result
+
+    def trial(self, images: Tensor, done: float, rows: Tensor) -> float:
+        """The loss of a batch; its gradients are computed, too, and change nothing."""
+        noise = Generator(images.device if self.noise is not None else "cpu").manual_seed(0)
+        result = compute_step(self.module, images, noise, self.precision, done, rows)
+        self.fabric.backward(result.total)
+        self.optimiser.zero_grad(set_to_none=True)
+        return result.total.item()
 
     def update(
         self, images: Tensor, done: float, noise: Generator | None = None, rows: Tensor | None = None

@@ -35,7 +35,7 @@ FORMAT = 1  # of config.yaml, which says so in its first line; one that does not
 
 _MAY_CHANGE_ON_RESUME = (
     *("images", "minutes", "validate_every", "sample_every", "checkpoint_every", "patience", "watch", "keep"),
-    *("accumulate", "cuda_graph"),
+    *("accumulate", "cuda_graph", "compile"),
     "optimiser",  # a run that the watcher stopped goes on with a smaller rate
 )
 _BEGUN = (LOCK_FILE, "environment.json", ".environment.json-", ".config.yaml-")  # there before config.yaml
