@@ -277,6 +277,15 @@ def aligned(result: Any) -> Iterator[list[str]]:
             yield [f"{group}: {name}", *(f"{row[key]:.3f}" for key in keys)]
 
 
+def turns(result: Any) -> Iterator[list[str]]:
+    """How far heads are turned, as measured, and which count as profiles."""
+    yield ["pictures", "no face", "profile", "error, degrees", "90th percentile"]
+    for name, row in result.items():
+        if name != "machine":
+            errors = ["" if row[key] is None else f"{row[key]:.1f}" for key in ("error_deg", "error_90_deg")]
+            yield [name, *(f"{row[key]:.3f}" for key in ("no_face", "profile")), *errors]
+
+
 def framings(result: Any) -> Iterator[list[str]]:
     """Cosine of features between crops of one image, beside that of two people."""
     yield ["features of one image", "cosine, mean", "lowest pair, mean", "two people"]
@@ -363,6 +372,7 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     "kills": ("kills.json", killed),
     "align": ("align.json", aligned),
     "framings": ("align.json", framings),
+    "turns": ("yaw.json", turns),
     "bench": ("bench.json", speed.shares),
     "training-step": ("training_step.json", speed.training_step),
     "gpu-steps": ("gpu.json", speed.gpu_steps),

@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_710, 15),  # unwarp
     "features": (1_310, 8),  # a folder is refused before images are embedded
     "interpretation": (1_083, 5),  # maps of features of the canonical view
-    "photo": (1_615, 7),  # over-exposed skin; why a photograph does not suit a model; its scene
+    "photo": (1_660, 8),  # how far faces are turned; over-exposed skin; why a photograph does not suit a model; its scene
     "networks": (710, 5),
     "storage": (960, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (660, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_460, 239)  # on the way to (37_000, 270)
-TEST_LINES = 26_203
+TOTAL = (39_505, 240)  # on the way to (37_000, 270)
+TEST_LINES = 26_225
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

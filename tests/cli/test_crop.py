@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from derender.data.synthetic import FaceSettings, faces
 from derender.report.viewer.images import rendered_examples
 from derender.scene.crop import Crop
 
@@ -71,6 +72,20 @@ def test_what_does_not_suit_the_model_is_drawn_only_with_force(photos, tmp_path,
     result, printed = numbers(*both, "--force")
     assert len(result["pictures"]) == 2 and result["framing"][str(blank)]["doubt"] == "no face is found"
     assert "drawn all the same: 1 image" in printed and not result["refused"]
+
+
+def test_profiles_are_left_out_however_well_they_are_reconstructed(photos, tmp_path, numbers):
+    view = {"yaw_deg": (70, 70), "yaw_sd_deg": None}
+    settings = FaceSettings.model_validate({"view": view, "pictures_per_identity": 1})
+    for name, seed in (("found.png", 1), ("missed.png", 3)):
+        head = faces.generate(1, 256, seed, settings).images[0].transpose(1, 2, 0)
+        Image.fromarray(np.pad(head, ((60, 60), (60, 60), (0, 0)), mode="edge")).save(tmp_path / name)
+    Image.open(photos / "near.png").save(tmp_path / "near.png")
+    result, _ = numbers("decompose", "-m", KNOWN, tmp_path, "-o", tmp_path / "out")
+    assert [Path(one["picture"]).name for one in result["pictures"]] == ["near.png"]
+    found, missed = (result["refused"][str(tmp_path / name)] for name in ("found.png", "missed.png"))
+    assert found == "the face is turned by 73 degrees, models of faces know 60"
+    assert missed.startswith("no face is found, perhaps a profile turned by 73 degrees (surest candidate: ")
 
 
 def test_another_word_is_refused(photos, tmp_path, refused):

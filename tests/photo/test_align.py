@@ -15,7 +15,8 @@ from derender.data.synthetic import faces
 from derender.data.synthetic.settings import FaceSettings
 from derender.photo import Face, Frame, find_faces
 from derender.photo.align import AFFINE, COLUMNS, _write
-from derender.photo.faces import BOTH_FAMILIES, TEMPLATES, UTKFACE, YAW_PER_SHARE, frame_of
+from derender.photo.faces import BOTH_FAMILIES, TEMPLATES, UTKFACE, frame_of
+from derender.photo.yaw import CROP, yaw_deg
 from derender.report.viewer.images import rendered_examples
 
 MODULE = sys.modules["derender.photo.align"]  # the package has the function by that name
@@ -187,12 +188,21 @@ def test_a_model_of_other_objects_is_refused(photos, tmp_path):
         derender.align(photos, tmp_path, model="cars-64")
 
 
-@pytest.mark.parametrize("yaw", [-70, -30, 0, 30, 70])
-def test_the_turn_of_a_face_is_read_from_its_nose(yaw):
-    beside = np.sin(np.radians(yaw)) / YAW_PER_SHARE
-    marks = np.array([(-0.4, 0), (0.4, 0), (beside, 0.5), (-0.4, 1), (0.4, 1)])
-    turned = 50 * marks @ np.array([[0.8, 0.6], [-0.6, 0.8]]) + 90
-    assert Face((0, 0, 1, 1), turned.astype(np.float32), 1.0).yaw_deg == pytest.approx(yaw, abs=0.1)
+@pytest.mark.parametrize("yaw", [-70, -40, 0, 40, 70])
+def test_the_turn_of_a_head_is_told(yaw):
+    """Of heads that are found, within 15 degrees."""
+    view = {"yaw_deg": (yaw, yaw), "yaw_sd_deg": None}
+    settings = FaceSettings.model_validate({"view": view, "pictures_per_identity": 1})
+    heads = (head.transpose(1, 2, 0) for head in faces.generate(8, 256, 5, settings).images)
+    places = [find_faces(np.pad(head, ((70, 70), (70, 70), (0, 0)), mode="edge")) for head in heads]
+    turns = [face.yaw_deg for place in places for face in place]
+    assert len(turns) >= 2 and np.abs(np.subtract(turns, yaw)).max() < 15
+
+
+def test_a_mirrored_crop_is_turned_the_other_way():
+    crop = np.random.default_rng(0).integers(0, 256, (3, CROP, CROP), dtype=np.uint8)
+    turn = yaw_deg(crop)
+    assert abs(turn) > 1 and yaw_deg(crop[:, :, ::-1].copy()) == pytest.approx(-turn, rel=1e-4)
 
 
 def test_faces_lying_on_their_side_are_found():

@@ -66,15 +66,12 @@ def test_why_a_photograph_does_not_suit_the_model(photo, model, monkeypatch):
         _, how, why = found_frame(pixels, model)
         return how, why
 
-    nose = face.points[2] + np.float32([1, 0]) * 0.9 * (face.points[0] - face.points[1])
-    turned = face.points.copy()
-    turned[2] = nose
-    assert (
-        doubt(points=turned)[0] == "profile" and "degrees, models of faces know 60" in doubt(points=turned)[1]
-    )
+    assert doubt(yaw_deg=-64.0) == ("profile", "the face is turned by 64 degrees, models of faces know 60")
+    assert doubt(yaw_deg=56.0) == ("face", "")
     rejected = "confidence 0.90 is below 0.95"
     assert doubt(rejected=rejected) == ("no face", f"no face is found (surest candidate: {rejected})")
-    assert "perhaps a profile, turned by" in doubt(points=turned, rejected=rejected)[1]
+    perhaps = f"no face is found, perhaps a profile turned by 70 degrees (surest candidate: {rejected})"
+    assert doubt(yaw_deg=70.0, rejected=rejected) == ("profile", perhaps)
 
 
 def test_edits_change_the_face_and_leave_the_rest(photo, model):

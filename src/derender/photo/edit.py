@@ -22,7 +22,7 @@ from derender.data import GivenImages, as_photos
 from derender.inputs import as_model
 from derender.model import Derenderer
 from derender.photo.detail import PhotoDetail
-from derender.photo.faces import PROFILE_DEG, UTKFACE, Face, face_candidates, frame_of, template_of
+from derender.photo.faces import PROFILE_DEG, UTKFACE, face_candidates, frame_of, template_of
 from derender.photo.frame import Frame
 from derender.render import Rendering
 from derender.scene import Scene
@@ -40,9 +40,6 @@ LARGEST_CROP = 1024
 
 MARGIN = 0.35
 """How far edits reach beyond the frame, in shares of its side."""
-
-SIDEWAYS_DEG = 25.0
-"""A rejected candidate that is turned farther may be a profile: generated ones measure 25 to 45 degrees."""
 
 FRAMES = ("face", "auto", "none")
 """Ways to find the part of a photograph that a model is given."""
@@ -280,20 +277,15 @@ def found_frame(
             return FoundFrame(place, "face")
         doubt = f"the face is turned by {turned:.0f} degrees, models of faces know {PROFILE_DEG:.0f}"
         return FoundFrame(place, "profile", doubt)
-    doubt = f"no face is found{_nearest_to_a_face(candidates)}"
+    how, doubt = "no face", "no face is found"
+    if candidates:
+        surest = max(candidates, key=lambda candidate: candidate.confidence)
+        if (turned := abs(surest.yaw_deg)) > PROFILE_DEG:
+            how, doubt = "profile", f"{doubt}, perhaps a profile turned by {turned:.0f} degrees"
+        doubt += f" (surest candidate: {surest.rejected})"
     if frame is None:
-        return FoundFrame(middle, "no face", doubt)
+        return FoundFrame(middle, how, doubt)
     raise ValueError(f"{doubt}: choose frame auto or none")
-
-
-def _nearest_to_a_face(candidates: list[Face]) -> str:
-    """What the surest of rejected candidates lacks, in brackets; empty where there are none."""
-    if not candidates:
-        return ""
-    surest = max(candidates, key=lambda candidate: candidate.confidence)
-    turned = abs(surest.yaw_deg)
-    profile = f"perhaps a profile, turned by {turned:.0f} degrees or more; " if turned >= SIDEWAYS_DEG else ""
-    return f" ({profile}surest candidate: {surest.rejected})"
 
 
 def _squares(middle: Frame, width: int, height: int) -> list[Frame]:

