@@ -33,7 +33,8 @@ from torch import nn
 from training_step import CONFIG, OurStep, seconds
 
 from derender.data import Sample, Stream, as_float, open_images
-from derender.features import FeatureTable, embed_images, embed_to_file
+from derender.features import FeatureTable, embed_images
+from derender.features.embedding import embed_to_file
 from derender.model import Derenderer
 from derender.objectives.perceptual import Vgg16Features
 

@@ -16,7 +16,8 @@ from machine import parser, publish
 
 import derender
 from derender.data import read_ground_truth
-from derender.evaluation import cluster, evaluate_geometry, identify
+from derender.evaluation import cluster, identify
+from derender.evaluation.truth import evaluate_geometry
 from derender.training.run_folder import read_metrics
 
 SCORED = ("accuracy", "nmi")

@@ -17,14 +17,14 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (7_225, 30),
-    "evaluation": (7_300, 32),
+    "evaluation": (7_265, 32),
     "report": (4_140, 25),  # images that do not suit a model are left out
     "cli": (2_325, 32),  # the same
     "training": (3_459, 18),  # CUDA graphs; networks compiled if asked; features of the canonical view
     "baselines": (2_465, 11),
     "render": (1_710, 15),  # unwarp
-    "features": (1_310, 8),  # a folder is refused before images are embedded
-    "interpretation": (1_083, 5),  # maps of features of the canonical view
+    "features": (1_302, 8),  # a folder is refused before images are embedded
+    "interpretation": (1_080, 5),  # maps of features of the canonical view
     "photo": (1_660, 8),  # how far faces are turned; over-exposed skin; why a photograph does not suit a model; its scene
     "networks": (710, 5),
     "storage": (960, 7),  # links are followed, errors name what was asked for
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (660, 8),
     "learn": (945, 5),
 }
-TOTAL = (39_505, 240)  # on the way to (37_000, 270)
-TEST_LINES = 26_225
+TOTAL = (39_465, 240)  # on the way to (37_000, 270)
+TEST_LINES = 26_195
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -12,7 +12,7 @@ import torch
 
 import derender
 from derender.data import check_images, read_ground_truth
-from derender.evaluation import evaluate_geometry
+from derender.evaluation.truth import evaluate_geometry
 from derender.model import Derenderer, load
 from derender.networks import FACTORS, Factor
 from derender.networks.encoders import activations

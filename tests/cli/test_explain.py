@@ -82,7 +82,7 @@ def test_the_numbers_add_up(why):
 
 def test_bad_words(tiny, data, why, tmp_path, refused):
     words = ("explain", "-m", tiny, "-d", data)
-    assert "no label 'clas'; did you mean 'class'" in refused(*words, "-l", "clas")
+    assert f"unknown label of {data} 'clas'; did you mean 'class'" in refused(*words, "-l", "clas")
     assert "give either --label NAME" in refused(*words)
     words = (*words, "-l", "class")
     assert "add --force to replace it" in refused(*words, "--out", why[0])

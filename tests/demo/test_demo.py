@@ -19,7 +19,7 @@ from derender.data.synthetic import faces
 from derender.demo import DemoSettings, demo_page, run_demo, run_own_demo
 from derender.demo.page import score_tables, shown_rows
 from derender.demo.story import STAGES
-from derender.evaluation import GeometryResult
+from derender.evaluation.truth import GeometryResult
 
 TINY = DemoSettings(
     train_pictures=24, test_pictures=16, images=16, minutes=5, fit_steps=2, shown=2, films=1, portrait_px=64,

@@ -10,9 +10,10 @@ from sklearn.metrics import adjusted_rand_score, f1_score, normalized_mutual_inf
 
 from derender.baselines.controls import pixel_features
 from derender.data import read_images
-from derender.evaluation import at_least, chance_scores, cluster, cluster_scores, compare_clusterings
+from derender.evaluation import chance_scores, cluster, cluster_scores, compare_clusterings
 from derender.evaluation.clustering import clustering_tables
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS, METRICS, metric
+from derender.evaluation.feature_rows import at_least
 from derender.evaluation.score_table import verdict
 from derender.features import FeatureTable
 
@@ -225,7 +226,6 @@ def test_one_call_averages_caps_clusters_and_scores(tracks, tmp_path):
     levels = cluster(tracks, "who", method="finch", mean_by=("who", "track"), **how)
     assert levels.tables[2].caption.startswith("FINCH on geometry") and levels.values["finch"]["geometry"]
     for bad, message in (
-        (("track", {"mean_by": ("who",)}), "label 'track' differs inside groups of who: average by it too"),
         (("wo", {}), "unknown label 'wo'; did you mean 'who'"),
         ((None, {}), "give either label"),
         (("who", {"factors": ("geometri",)}), "unknown factor 'geometri'"),

@@ -6,8 +6,8 @@ from sklearn.metrics import roc_auc_score
 
 from derender.baselines.controls import DESCRIPTORS, descriptor_features
 from derender.data import ImageSet, half_of
-from derender.evaluation import area_under_roc, identify, read_pairs, verify
 from derender.evaluation.feature_rows import control_rows
+from derender.evaluation.identity import area_under_roc, identify, read_pairs, verify
 from derender.evaluation.options import Options
 from derender.features import FeatureTable
 

@@ -90,7 +90,7 @@ def test_the_owners_test_part_and_groups_are_kept():
         ((10, 100), {}, "learn from 10, 100 labelled rows: 80 can be learned from and 80 are tested"),
         ((), {}, "learn from no labelled rows"),
         ((10,), {"seeds": ()}, "at least one seed"),
-        ((10,), {"test_fraction": 1.0}, "between 0 and 1, got 1.0"),
+        ((10,), {"test_fraction": 1.0}, "0 can be learned from and 160 are tested"),
     ],
 )
 def test_rows_that_cannot_be_chosen(counts, options, message):

@@ -96,11 +96,8 @@ def test_clustering_tables_have_rows_of_finch_beside_ward():
     alone = compare("emotion", tables_of(), method="finch", resamples=20, cache="none")
     assert "ours, FINCH" not in alone.tables[0].values()
     assert values["noise, FINCH"]["accuracy"] == alone.tables[0].values()["noise"]["accuracy"]
-    six, labels = (
-        tuple("123456"),
-        {"expression": np.array(list("aabbcd"))},
-    )  # FINCH makes three clusters at most
-    few = FeatureTable(six, {"geometry": FEATURES["noise"][0][:6]}, labels)
+    labels = {"expression": np.array(list("aabbcd"))}  # FINCH makes three clusters at most
+    few = FeatureTable(tuple("123456"), {"geometry": FEATURES["noise"][0][:6]}, labels)
     result = compare("emotion", {"few": few}, factors=None, resamples=20, cache="none")
     assert "few, FINCH" not in result.tables[0].values() and "few" in result.tables[0].values()
     assert any("FINCH left out: FINCH's finest partition" in note for note in result.notes)

@@ -7,8 +7,14 @@ import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-from derender.evaluation import evaluate_reconstruction, reconstruction_scores
-from derender.evaluation.pixels import WINDOW, component_count, from_components, masked_ssim
+from derender.evaluation.pixels import (
+    WINDOW,
+    component_count,
+    evaluate_reconstruction,
+    from_components,
+    masked_ssim,
+    reconstruction_scores,
+)
 
 
 def test_only_the_mask_counts():

@@ -110,12 +110,7 @@ def test_a_table_of_scored_rows_carries_interval_and_deviation():
     columns = {"a": Column("A", "high"), "b": Column("B")}
     result = scored_table("c", "features", rows, columns, more={Column("runs"): lambda row: row.runs})
     assert [column.name for column in result.columns] == ["A", "95 %", "±", "B", "runs"]
-    assert [text for text, _ in result.texts(result.rows[0])] == [
-        "0.500",
-        "0.400-0.600",
-        "0.100",
-        "0.250",
-        "2",
-    ]
-    assert [text for text, _ in result.texts(result.rows[1])] == ["0.125", "-", "-", "0.250", "1"]
+    ours, chance = ([text for text, _ in result.texts(row)] for row in result.rows)
+    assert ours == ["0.500", "0.400-0.600", "0.100", "0.250", "2"]
+    assert chance == ["0.125", "-", "-", "0.250", "1"]
     assert [row.control for row in result.rows] == [False, True]

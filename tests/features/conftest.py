@@ -1,4 +1,4 @@
-"""A tiny model and image set with the interfaces that features need."""
+"""A tiny model and image set with the interfaces that features need; tables compared."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,19 @@ import torch
 from torch import nn
 
 from derender.data import ImageSet
+from derender.features import FeatureTable
 
 SIZE = 8
+
+
+def assert_same(table: FeatureTable, expected: FeatureTable) -> None:
+    """Bit for bit, kinds of columns and their order included."""
+    assert table.files == expected.files and table.origin == expected.origin
+    assert list(table.factors) == list(expected.factors) and list(table.labels) == list(expected.labels)
+    for name, values in {**expected.factors, **expected.labels}.items():
+        result = {**table.factors, **table.labels}[name]
+        assert result.dtype.kind == values.dtype.kind, name
+        np.testing.assert_array_equal(result, values)
 
 
 class TinyModel(nn.Module):

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from derender.features import FeatureTable, search
+from derender.features import FeatureTable
+from derender.features.neighbours import search
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "scale.md"
 

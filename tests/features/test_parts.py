@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from tests.features.conftest import assert_same
 
 from derender.data import ImageSet
-from derender.features import FeatureTable, embed_image_set, embed_to_file, embedding
+from derender.features import FeatureTable, embed_image_set, embedding
+from derender.features.embedding import embed_to_file
 from derender.storage.atomic import DamageNoticed
 
 
@@ -28,12 +30,6 @@ def stopped(model, pictures, tmp_path, monkeypatch):
     return sorted((tmp_path / "F.parquet.partial").glob("part-*"))
 
 
-def same_table(file, wanted: FeatureTable) -> bool:
-    result = FeatureTable.read(file)
-    same = (np.array_equal(result.factors[name], wanted.factors[name]) for name in wanted.factors)
-    return result.files == wanted.files and all(same)
-
-
 def flipped(file) -> None:
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
@@ -55,7 +51,8 @@ def test_a_damaged_part_is_made_again_with_those_after_it(model, pictures, stopp
     with pytest.warns(DamageNoticed, match=rf"damaged \({words}\): going on from the 16 rows before it"):
         done = embed_to_file(pictures, model, tmp_path / "F.parquet", batch_size=8)
     assert (done.resumed, done.rows) == (16, 60)
-    assert same_table(tmp_path / "F.parquet", embed_image_set(model, pictures, batch_size=8))
+    expected = embed_image_set(model, pictures, batch_size=8)
+    assert_same(FeatureTable.read(tmp_path / "F.parquet"), expected)
     assert not list(tmp_path.glob("*.partial"))
 
 
@@ -77,6 +74,6 @@ def test_a_changed_byte_in_a_finished_table_is_an_error_and_not_another_number(m
     content[int(at * len(content))] ^= 16
     file.write_bytes(content)
     try:
-        assert same_table(file, wanted)
+        assert_same(FeatureTable.read(file), wanted)
     except ValueError as problem:
         assert "not a readable parquet file" in str(problem) or str(file) in str(problem)

@@ -12,7 +12,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 import derender
-from derender.features import DisentangledFeatures, embed_image_set
+from derender.features import embed_image_set
+from derender.features.transformer import DisentangledFeatures
 
 
 @pytest.fixture

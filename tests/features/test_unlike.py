@@ -9,7 +9,7 @@ import derender
 from derender.cli import main
 from derender.data import ImageSet
 from derender.data.synthetic import cars
-from derender.features import unlike_training
+from derender.features.embedding import unlike_training
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from derender.evaluation.linear_task import Rows, task_of
-from derender.interpretation import Probe, explain_labels
+from derender.interpretation import explain_labels
 from derender.interpretation.attribution import factor_shares, integrated_gradients
+from derender.interpretation.probe import Probe
 
 SIZES = {"geometry": 4, "albedo": 4, "light": 4}
 

@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from kills import made_material
 
-from derender.features import embed_to_file
+from derender.features.embedding import embed_to_file
 from derender.learn import train
 from derender.model import load
 from derender.report.viewer.app import Application

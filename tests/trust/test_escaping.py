@@ -12,7 +12,7 @@ from derender.data import ImageSet, Skipped
 from derender.data.doctor import doctor
 from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.score_table import Column, Row, ScoreTable
-from derender.interpretation import Explained, cluster_shares, explain_labels, pair_parts
+from derender.interpretation import cluster_shares, explain_labels, explanation, pair_parts
 from derender.report import charts
 from derender.report.comparison import comparison_page
 from derender.report.doctor import doctor_page
@@ -84,7 +84,7 @@ def test_explanation(evil):
     images = ImageSet(np.zeros((1, 3, 8, 8), np.uint8), (evil,), source=evil)
     pair = (evil, evil), pair_parts(features, 0, 1)
     model, clusters = SimpleNamespace(source=evil), cluster_shares(features, np.arange(90) % 2)
-    result = Explained(shares, model, images, task, rows, clusters, pair)
+    result = explanation.Explained(shares, model, images, task, rows, clusters, pair)
     harmless(explanation_page(result, share_chart(shares)[0], sheets), evil)
 
 

@@ -44,6 +44,7 @@ def embed(
     """
     refuse_existing_file(out, output.force)
     import derender
+    from derender.features.embedding import unlike_training
 
     name = baselines.baseline
     if name is None and model is None:
@@ -65,7 +66,7 @@ def embed(
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
     notice("\n".join([done.describe(), *named]))
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())
-    if name is None and (odd := derender.features.unlike_training(images.address, model, **images.how)):
+    if name is None and (odd := unlike_training(images.address, model, **images.how)):
         notice(odd)
     output.result(f"{counted(done.rows, 'rows')} in {out}: {sizes}")
     names = ("rows", "factors", "labels", "origin", "skipped", "copies", "resumed")

@@ -44,9 +44,9 @@ def pack(
         copy = as_model(packed.folder, device=model.device)
         with progress_bar("comparing") as report:
             cost = copy_cost(original, copy, chosen.images, progress=report)
-        moved = ", ".join(f"{name} {share:.2%}" for name, share in cost.moved.items())
+        moved = ", ".join(f"{name} {share:.2%}" for name, share in cost["moved"].items())
         notice(f"features moved, as a share of the distance between two images: {moved}")
-        notice(f"reconstruction L1 {cost.l1:.5f}, before {cost.l1_before:.5f}")
+        notice(f"reconstruction L1 {cost['l1']:.5f}, before {cost['l1_before']:.5f}")
         values |= {"pictures": len(chosen), "cost": cost}
     output.result(f"model {packed.folder}")
     output.write(values)

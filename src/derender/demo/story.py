@@ -15,12 +15,14 @@ from jaxtyping import UInt8
 from PIL import Image
 from pydantic import Field
 
-from derender import evaluation
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_images
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, LightSettings, faces, require_empty
+from derender.evaluation import cluster, clusterings
+from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, mean_image
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import ScoreTable
+from derender.evaluation.truth import FactorResult, GeometryResult, evaluate_factors, evaluate_geometry
 from derender.features import embed_image_set
 from derender.learn import train as train_on
 from derender.model import Derenderer, load
@@ -188,10 +190,10 @@ class DemoResult:
     truth: GroundTruth  # the unseen images with everything that made them
     # of scenes optimised for ``settings.fit_steps``; ``geometry_beside`` without steps, and by the bundled
     # model where the images have its size
-    geometry: evaluation.GeometryResult
-    geometry_beside: dict[str, evaluation.GeometryResult]
-    factors: evaluation.FactorResult
-    reconstruction: evaluation.ReconstructionResult
+    geometry: GeometryResult
+    geometry_beside: dict[str, GeometryResult]
+    factors: FactorResult
+    reconstruction: ReconstructionResult
     clustering: ScoreTable  # Ward clusters by identity, of features and controls
     clusters: np.ndarray  # (N,) the cluster of each unseen image by the model's features
     seconds: dict[str, float]  # time of each stage
@@ -246,23 +248,22 @@ def run_demo(
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
     model, bundled = load(out / "run", device="cpu"), load(BUNDLED, device="cpu")
     at(STAGES[4], 0, 4, "geometry")
-    geometry = evaluation.evaluate_geometry(
-        optimised(model, settings.fit_steps), truth, untrained=untrained_twin(model, seed)
-    )
+    fitted = optimised(model, settings.fit_steps)
+    geometry = evaluate_geometry(fitted, truth, untrained=untrained_twin(model, seed))
     beside = {"this run, feed-forward": model} if settings.fit_steps else {}
     beside |= {BUNDLED: bundled} if size == bundled.image_size else {}
-    geometry_beside = {name: evaluation.evaluate_geometry(one, truth) for name, one in beside.items()}
-    factors = evaluation.evaluate_factors(model, truth)
+    geometry_beside = {name: evaluate_geometry(one, truth) for name, one in beside.items()}
+    factors = evaluate_factors(model, truth)
     at(STAGES[4], 1, 4, "reconstruction")
-    reconstruction = evaluation.evaluate_reconstruction(
-        model, unseen.images, mean=evaluation.mean_image(seen.images), components_of=seen.images[:4096]
+    reconstruction = evaluate_reconstruction(
+        model, unseen.images, mean=mean_image(seen.images), components_of=seen.images[:4096]
     )
     at(STAGES[4], 2, 4, "features")
-    scores = evaluation.cluster(model, "identity", images=unseen, seed=seed, cache="none")
+    scores = cluster(model, "identity", images=unseen, seed=seed, cache="none")
     at(STAGES[4], 3, 4, "clusters")
     features = embed_image_set(model, unseen).concatenate(("geometry", "albedo"))
     people = len(np.unique(truth.labels["identity"]))
-    clusters = evaluation.clusterings(features, [people])[people]
+    clusters = clusterings(features, [people])[people]
     at(STAGES[4], 4, 4)
     return DemoResult(
         settings, seed, config, trained, model, bundled, live.opening, seen, truth,

@@ -7,6 +7,7 @@ a convention. Beside the model stand the best constant answer and the same netwo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -117,16 +118,15 @@ def _angles(
     true, read = known_angles(how.at(model.image_size), table, labels)
     nets = {"model": optimised(model, fit_steps), "untrained model": untrained_twin(model, how.seed)}
 
+    def see(net: Any, batch: Tensor) -> np.ndarray:
+        scene = net.decompose(batch)
+        pose = torch.rad2deg(scene.camera[:, [1, 0, 2]])
+        angles = pose if what == "Pose" else _spherical(light_in_camera(scene.light, scene.camera))
+        return angles.double().numpy(force=True)
+
     results = {}
     for name, net in nets.items():
-
-        def see(batch: Tensor, net: Any = net) -> np.ndarray:
-            scene = net.decompose(batch)
-            pose = torch.rad2deg(scene.camera[:, [1, 0, 2]])
-            angles = pose if what == "Pose" else _spherical(light_in_camera(scene.light, scene.camera))
-            return angles.double().numpy(force=True)
-
-        parts = map_batches(see, net, read.images, batch_size=64, progress=how.stage(name))
+        parts = map_batches(partial(see, net), net, read.images, batch_size=64, progress=how.stage(name))
         results[name] = np.concatenate(parts)
     people = read.labels.get("identity", np.array(read.files)).astype(str)
     weights = once_and_resampled(people, how.resamples, how.seed)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
-from pydantic import ValidationError
 
 from derender.baselines import load_baseline
 from derender.baselines.controls import control_table, descriptor_features, pca_features, pixel_features
@@ -28,6 +27,7 @@ from derender.features.extract import model_facts
 from derender.inputs import Progress, as_model, device_named
 from derender.model import Derenderer
 from derender.presets import ModelSettings
+from derender.storage.bounded import first_line
 from derender.storage.folder import CONFIG_FILE, saved_config
 
 ModelSource = Derenderer | str | Path
@@ -345,10 +345,9 @@ def architecture(rows: Sequence[FeatureRow]) -> ModelSettings | None:
         if stored is not None and not row.control:
             try:
                 return ModelSettings.model_validate(stored)
-            except ValidationError as error:
-                first = error.errors()[0]
+            except ValueError as error:
                 raise ValueError(
                     f"features {row.name!r} were made by a model this version does not know "
-                    f"({'.'.join(map(str, first['loc']))}: {first['msg']}): embed the data again"
+                    f"({first_line(error)}): embed the data again"
                 ) from error
     return None

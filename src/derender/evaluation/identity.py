@@ -141,8 +141,8 @@ def _gallery(
 class Pairs:
     """Pairs of image names without folder and suffix, whether each shows one person, and its fold from 0."""
 
-    first: tuple[str, ...]
-    second: tuple[str, ...]
+    first: np.ndarray
+    second: np.ndarray
     same: np.ndarray
     fold: np.ndarray
 
@@ -151,8 +151,7 @@ class Pairs:
 
     def select(self, rows: np.ndarray) -> "Pairs":
         """Only these pairs."""
-        first, second = (tuple(names[row] for row in rows) for names in (self.first, self.second))
-        return Pairs(first, second, self.same[rows], self.fold[rows])
+        return Pairs(*(column[rows] for column in vars(self).values()))
 
 
 def read_pairs(path: str | Path) -> Pairs:
@@ -184,8 +183,7 @@ def read_pairs(path: str | Path) -> Pairs:
             raise ValueError(f"{path}, line {number + 2}: expected {form}, got {line!r}")
         names = (f"{name}_{int(place):04d}" for name, place in (words[:2], words[2:]))
         rows.append((*names, matched, number // (2 * count) if folds > 1 else number % FOLDS))
-    first, second, same, fold = zip(*rows, strict=True)
-    return Pairs(first, second, np.array(same), np.array(fold))
+    return Pairs(*map(np.array, zip(*rows, strict=True)))
 
 
 def verify(

@@ -111,8 +111,6 @@ def divide_rows(
     known, tested = task.known, np.asarray(partition) == "test"
     if tested.any():
         return np.flatnonzero(known & ~tested), np.flatnonzero(known & tested)
-    if not 0 < test_fraction < 1:
-        raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
     split = split_indices(files, (1 - test_fraction, 0.0, test_fraction), groups=groups)
     learn, test = split.train[known[split.train]], split.test[known[split.test]]
     if groups is not None and task.kind == "classes" and len(learn) and len(test):

@@ -10,18 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from derender.data import ImageSet
+from derender.evaluation import feature_rows
 from derender.evaluation.clustering import clustering_tables, compare_clusterings
 from derender.evaluation.clustering_methods import METHODS
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
-from derender.evaluation.feature_rows import (
-    FeatureSource,
-    chosen_labels,
-    is_model,
-    prepare,
-    row_of,
-    runs_of,
-    with_controls,
-)
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
@@ -34,7 +26,7 @@ PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
 
 def compare(
     table: str,
-    features: Mapping[str, FeatureSource | Sequence[FeatureSource]],
+    features: Mapping[str, feature_rows.FeatureSource | Sequence[feature_rows.FeatureSource]],
     images: ImageSet | str | Path | None = None,
     *,
     method: str = "ward",
@@ -65,7 +57,8 @@ def compare(
     """
     spec = named(TABLES, table, "table")
     how = Options.of(options, images=images, descriptors=table == "identity")
-    models = {name: [run for run in runs_of(runs) if is_model(run)] for name, runs in features.items()}
+    given = {name: feature_rows.runs_of(runs) for name, runs in features.items()}
+    models = {name: list(filter(feature_rows.is_model, runs)) for name, runs in given.items()}
     models = {name: runs for name, runs in models.items() if runs}
     numbers = {"table": table, "number": spec.number}
     if spec.kind == "segment":
@@ -94,7 +87,8 @@ def compare(
         raise ValueError("finetune trains the encoders of models: give the linear table, models and images")
     if supervised and not finetune:
         raise ValueError("supervised is a row among fine-tuned models: give finetune, too")
-    rows = with_controls([row_of(name, runs, how) for name, runs in features.items()], how)
+    rows = [feature_rows.row_of(name, runs, how) for name, runs in given.items()]
+    rows = feature_rows.with_controls(rows, how)
     first = rows[0].tables[0]
     parts = [part for part in spec.parts if part.columns(first)]
     if not parts:
@@ -105,14 +99,16 @@ def compare(
     for part in parts:
         columns = part.columns(first)
         if part.labels == (ATTRIBUTES,):
-            columns, left_out = chosen_labels(first, None, True, 2 if spec.kind == "linear" else 1)
+            columns, left_out = feature_rows.chosen_labels(
+                first, None, True, 2 if spec.kind == "linear" else 1
+            )
             notes += left_out
         out = part.left_out(first)
         if out.any():
             notes.append(f"{part.name}: {out.sum():,} rows left out that are none of the paper's classes")
         kept = [replace(row, tables=tuple(one.select(~out) for one in row.tables)) for row in rows]
         try:
-            ready = prepare(kept, columns, **part.rows(first))
+            ready = feature_rows.prepare(kept, columns, **part.rows(first))
         except ValueError as error:
             if part.size is None or len(parts) == 1:
                 raise

@@ -7,7 +7,7 @@ such as one of rounded weights, comes to its model. The unit is how far two of t
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -128,23 +128,14 @@ def optimised(model: Derenderer, steps: int | None) -> Derenderer:
     return fitted
 
 
-@dataclass(frozen=True)
-class CopyCost:
-    """By factor how far an image's feature moved: the mean, over the root mean square distance of two images.
-    Mean absolute error of the images re-rendered by the copy, and before, by the model.
-    """
-
-    moved: dict[str, float]
-    l1: float
-    l1_before: float
-
-
 def copy_cost(
     model: Derenderer, other: Derenderer, images: np.ndarray, *, progress: Progress | None = None
-) -> CopyCost:
+) -> dict[str, Any]:
     """Compare a copy of a model, ``other``, with it on two or more uint8 images (N, 3, H, W).
 
-    ``progress`` is called with (features made, features to make), two of each image.
+    ``moved``: by factor how far an image's feature moved: the mean, over the root mean square distance of two
+    images. ``l1``, ``l1_before``: mean absolute error of the images re-rendered by the copy, and by the
+    model. ``progress`` is called with (features made, features to make), two of each image.
     """
     passes = []
     for number, one in enumerate((model, other)):
@@ -155,5 +146,5 @@ def copy_cost(
         own, moved_to = np.asarray(feature, np.float64), np.asarray(passes[1][name], np.float64)
         apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two images drawn at random
         moved[name] = float(np.linalg.norm(own - moved_to, axis=1).mean() / apart) if apart else 0.0
-    errors = [evaluate_reconstruction(one, images).model.l1 for one in (other, model)]
-    return CopyCost(moved, *errors)
+    after, before = (evaluate_reconstruction(one, images).model.l1 for one in (other, model))
+    return {"moved": moved, "l1": after, "l1_before": before}

@@ -26,7 +26,7 @@ from torch.nn.functional import cross_entropy
 from derender.baselines.controls import flat_pixels
 from derender.data import ImageSet, split_indices
 from derender.evaluation.pixels import component_count, evenly
-from derender.features import map_batches, named
+from derender.features import chosen, map_batches
 from derender.features.extract import as_batch
 from derender.networks.encoders import UNetDecoder, UNetEncoder
 from derender.settings import Settings
@@ -75,8 +75,6 @@ def divide(
     last ``test_fraction`` of that order are tested. ``labelled`` limits the training images. ValueError:
     nothing to learn from or to test, more requested than there is, or a single class.
     """
-    if not 0 < test_fraction < 1:
-        raise ValueError(f"the tested share must lie between 0 and 1, got {test_fraction}")
     owners = images.partition
     if owners is not None and (owners == "test").any():
         test = np.flatnonzero(owners == "test")
@@ -162,19 +160,17 @@ def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str,
     own_decoder = getattr(model, "unet_decoder", None) is not None
     if names is None:
         names = [name for name, variant in VARIANTS.items() if own_decoder or not variant.decoder]
-    if not names:
-        raise ValueError(f"name a variant: there is {', '.join(VARIANTS)}")
-    chosen = {name: named(VARIANTS, name, "variant") for name in names}
-    for factor in sorted({factor for variant in chosen.values() for factor in variant.factors}):
+    variants = {name: VARIANTS[name] for name in chosen(names, VARIANTS, "variant")}
+    for factor in sorted({factor for variant in variants.values() for factor in variant.factors}):
         encoder = getattr(model.nets[factor], "encoder", None) if factor in model.nets else None
         if not isinstance(encoder, UNetEncoder):
             raise ValueError(
                 f"the model has no U-Net encoder for {factor}, and segmentation needs its skip features: "
                 "make one with derender unet, or train one with derender train --set encoder=unet"
             )
-    if any(variant.decoder for variant in chosen.values()) and not own_decoder:
+    if any(variant.decoder for variant in variants.values()) and not own_decoder:
         raise ValueError("the model has no U-Net decoder: make a copy that has with derender unet")
-    return chosen
+    return variants
 
 
 class SegmentationNet(nn.Module):

@@ -29,7 +29,7 @@ from derender.data import ImageSet
 from derender.data.synthetic import KINDS, SyntheticSet
 from derender.evaluation.linear_task import Task, task_of
 from derender.evaluation.memory import Memory
-from derender.features import Progress, map_batches, missing, model_fingerprint, named
+from derender.features import Progress, chosen, map_batches, missing, model_fingerprint, named
 from derender.scene import Scene
 from derender.training.step import fill_uncovered
 
@@ -107,9 +107,7 @@ AXES: Mapping[str, Axis] = {
 
 def chosen_axes(names: Sequence[str], kind: str | None = None) -> tuple[Axis, ...]:
     """Axes by name; an unknown one, or one about which generated images cannot be rotated, is an error."""
-    if not names:
-        raise ValueError(f"name an axis: there is {', '.join(AXES)}")
-    axes = tuple(named(AXES, name, "axis") for name in dict.fromkeys(names))
+    axes = tuple(AXES[name] for name in dict.fromkeys(chosen(names, AXES, "axis")))
     for axis in axes:
         if kind is not None and kind not in axis.settings:
             raise ValueError(f"generated {kind} cannot be rotated about the axis {axis.name!r}: leave it out")

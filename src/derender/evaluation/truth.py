@@ -272,7 +272,9 @@ def light_error(
     """
     predicted, true = light_in_camera(light_pred, camera_pred), light_in_camera(light_true, camera_true)
     if aligned:
-        predicted = predicted @ _nearest_rotation(predicted.mT @ true)
+        u, _, vh = torch.linalg.svd(predicted.mT @ true)
+        u[:, 2] *= torch.linalg.det(u @ vh).sign()  # never a reflection
+        predicted = predicted @ u @ vh
     return _angles(angle_deg(predicted, true))
 
 
@@ -284,10 +286,10 @@ def camera_error(camera_pred: Float[Tensor, "n 6"], camera_true: Float[Tensor, "
     squares. A constant prediction then scores the spread of the true cameras, which is the control to print
     beside it.
     """
-    predicted, true = (rotation_matrix(camera[:, :3].double()) for camera in (camera_pred, camera_true))
-    rest = (true @ _nearest_rotation((true.mT @ predicted).sum(dim=0))).mT @ predicted
-    angles_rad = Rotation.from_matrix(rest.numpy(force=True)).magnitude()
-    return _angles(torch.from_numpy(angles_rad).rad2deg())
+    angles = (camera[:, :3].double().numpy(force=True) for camera in (camera_pred, camera_true))
+    predicted, true = (Rotation.from_euler("xyz", angles_rad) for angles_rad in angles)
+    turned = true.inv() * predicted
+    return _angles(torch.from_numpy((turned.mean().inv() * turned).magnitude()).rad2deg())
 
 
 def evaluate_factors(
@@ -338,14 +340,6 @@ def evaluate_factors(
 
 def light_in_camera(light: Float[Tensor, "n 4"], camera: Float[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
     return (rotation_matrix(camera[:, :3].double()) @ light_direction(light.double())[..., None])[..., 0]
-
-
-def _nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation with the largest inner product with a matrix; never a reflection."""
-    u, _, vh = torch.linalg.svd(matrix)
-    signs = torch.ones(3, dtype=u.dtype, device=u.device)
-    signs[2] = torch.linalg.det(u @ vh).sign()
-    return (u * signs) @ vh
 
 
 def _angles(degrees: Tensor) -> AngleScores:

@@ -17,7 +17,7 @@ from derender.features.extract import (
     model_fingerprint,
     table_labels,
 )
-from derender.features.table import FeatureTable, missing, named
+from derender.features.table import FeatureTable, chosen, missing, named
 
 if TYPE_CHECKING:
     from derender.features.embedding import Embedded, embed, embed_to_file, unlike_training
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from derender.features.transformer import DisentangledFeatures
 
 __all__ = [
-    "DisentangledFeatures", "Embedded", "FeatureTable", "Progress", "embed", "embed_image_set",
+    "DisentangledFeatures", "Embedded", "FeatureTable", "Progress", "chosen", "embed", "embed_image_set",
     "embed_images", "embed_to_file", "evaluating", "map_batches", "missing", "model_fingerprint", "named",
     "search", "table_labels", "unlike_training",
 ]  # fmt: skip

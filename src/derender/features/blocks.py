@@ -28,12 +28,13 @@ import torch
 
 from derender.data import ImageSet, Skipped, Unreadable, quiet_pillow
 from derender.data.stream import Decoded, Kinds, Sample, Stream, column_of, decode_samples, decoded
-from derender.features.extract import as_batch, evaluating, factor_codes
+from derender.features.extract import as_batch, factor_codes
 from derender.features.parquet import factor_column, factor_values
 from derender.features.table import FeatureTable, check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured, write_whole
 from derender.storage.bounded import parse_json, read_json
 from derender.storage.places import optional
+from derender.training.process import evaluating
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]  # opens the stream anew, in whatever process
 Block = tuple[list[Decoded], Mapping[str, np.ndarray]]
@@ -53,7 +54,7 @@ def local_blocks(
     workers: int | None = None,
 ) -> Iterator[Iterator[Block]]:  # fmt: skip
     """The blocks from sample ``start`` on, computed in this process while a pool decodes ahead."""
-    with quiet_pillow(), evaluating(model), ExitStack() as stack:
+    with quiet_pillow(), evaluating(model), torch.inference_mode(), ExitStack() as stack:
         if isinstance(source, ImageSet):
             pairs = enumerate(zip(source.files, source.images, strict=True))
             samples = (
@@ -91,7 +92,7 @@ class BlockEmbedder:
         size = self.size if limit is None else min(self.size, max(0, limit - start))
         samples = list(islice(self.samples, passed, passed + size))
         self.at = start + len(samples)
-        with quiet_pillow(), evaluating(self.model):
+        with quiet_pillow(), evaluating(self.model), torch.inference_mode():
             return embedded_block(self.model, decode_samples(start, samples, self.model.image_size, self.fit))
 
     def __call__(self, numbers: dict[str, Any]) -> dict[str, list[bytes]]:

@@ -1,8 +1,7 @@
 """From a model and images to a FeatureTable."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 import derender
 from derender.data import ImageSet, Progress, as_float
 from derender.features.table import FeatureTable
-from derender.training import process
+from derender.training.process import evaluating
 
 T = TypeVar("T")
 
@@ -42,19 +41,12 @@ def map_batches(
     if len(images) == 0:
         raise ValueError("there are no images")
     results = []
-    with evaluating(model):
+    with evaluating(model), torch.inference_mode():
         for start in range(0, len(images), batch_size):
             results.append(function(as_batch(images[start : start + batch_size], model.device)))
             if progress is not None:
                 progress(min(start + batch_size, len(images)), len(images))
     return results
-
-
-@contextmanager
-def evaluating(model: Any) -> Iterator[None]:
-    """The model in evaluation mode and without gradients meanwhile, and afterwards as it was."""
-    with process.evaluating(model), torch.inference_mode():
-        yield
 
 
 def as_batch(images: np.ndarray, device: torch.device) -> Tensor:

@@ -94,8 +94,7 @@ def search(
         unchecked = rows.origin.get("weights") is None
         image = read_image(Path(like), net.image_size)
         codes = {key: values[0] for key, values in embed_images(net, image[None]).items()}
-        if factor not in codes:
-            raise ValueError(f"{model} makes no {factor!r}; it makes {', '.join(codes)}")
+        named(codes, factor, f"factor of {model}")
     itself = same_image(rows, codes).tolist()
     hidden = [] if copies else itself
     if len(hidden) == len(rows):

@@ -22,13 +22,13 @@ def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
     return values[name]
 
 
-def chosen(factors: Sequence[str] | None, among: Mapping[str, Any]) -> list[str]:
-    """Names of factors, one or several, None for all; none, or one that is not there, is an error."""
-    names = [factors] if isinstance(factors, str) else list(among if factors is None else factors)
+def chosen(names: Sequence[str] | None, among: Mapping[str, Any], kind: str = "factor") -> list[str]:
+    """Names, one or several, None for all; none, or one that is not there, is an error."""
+    names = [names] if isinstance(names, str) else list(among if names is None else names)
     if not names:
-        raise ValueError(f"name at least one factor; there is {', '.join(among)}")
+        raise ValueError(f"name at least one {kind}; there is {', '.join(among)}")
     for name in names:
-        named(among, name, "factor")
+        named(among, name, kind)
     return names
 
 

@@ -17,7 +17,7 @@ from scipy.special import expit, softmax
 from derender.data import suggestion
 from derender.evaluation.linear_probes import PAPER_HEAD, HeadSettings, fitted_heads, logistic_weights
 from derender.evaluation.linear_task import Task, task_of
-from derender.features import missing
+from derender.features import missing, named
 from derender.settings import Settings
 from derender.storage.atomic import new_folder
 from derender.storage.bounded import read_json
@@ -60,11 +60,8 @@ def question(
         )
     columns, known = {}, {}
     for name in names:
-        if name not in labels:
-            raise ValueError(
-                f"{source} has no label {name!r}{suggestion(name, labels)}; there is {', '.join(labels)}"
-            )
-        columns[name] = without_rare(in_bins(np.asarray(labels[name]), bins), min_count)
+        values = np.asarray(named(labels, name, f"label of {source}"))
+        columns[name] = without_rare(in_bins(values, bins), min_count)
         known[name] = columns[name][~missing(columns[name])].tolist()
         if len(known[name]) < FEWEST_IMAGES:
             raise ValueError(

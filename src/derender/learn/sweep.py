@@ -38,7 +38,7 @@ from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options, aligned
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES
 from derender.evaluation.score_table import Row, Scores, ScoreTable
-from derender.features import FeatureTable, embed
+from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model, split_of
 from derender.learn.plan import OURS, WITHOUT_LOOP, ImageSource, Plan, ScoredSet, read_plan
 from derender.learn.runs import train
@@ -173,7 +173,7 @@ class Sweep:
                 net = open_baseline(kind, model, device=self.device, **how)
             if scored.part != "all" and plan.is_trained(method) and split_of(str(model)) not in (split, None):
                 raise ValueError(f"{model} has another split than the plan and may have seen these images")
-            embed(self.images(scored, net.image_size), net, progress=show).write(file)
+            embed_image_set(net, self.images(scored, net.image_size), progress=show).write(file)
 
         files = [Path(model or os.devnull, inner, WEIGHTS_FILE) for inner in ("", "model")]
         weights = by or [measured(file) for file in files if file.is_file()]

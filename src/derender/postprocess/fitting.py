@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.settings import Settings
-from derender.storage.bounded import parse_json
+from derender.storage.bounded import first_line, parse_json
 from derender.storage.tensors import read_described, write_tensors
 
 PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
@@ -298,7 +298,7 @@ class Fitting(nn.Module):
             )
             fitting = cls(MorphableMaps(means, axes), settings, float(tensors["length"]))
         except (KeyError, ValidationError, RuntimeError) as error:
-            raise ValueError(f"{Path(file).name} holds no fitting ({str(error).splitlines()[0]})") from error
+            raise ValueError(f"{Path(file).name} holds no fitting ({first_line(error)})") from error
         for name, mean in means.items():
             expected = (*mean.shape[:-2], image_size, image_size)
             if image_size is not None and tuple(mean.shape) != expected:

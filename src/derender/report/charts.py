@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
-from derender.evaluation.disentanglement import DisentanglementCard
+from derender.evaluation.disentanglement.card import DisentanglementCard
 from derender.report.page import png_bytes
 from derender.storage.atomic import write_whole
 

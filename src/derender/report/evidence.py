@@ -18,9 +18,10 @@ from derender.baselines import read_any_config
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, Progress, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
-from derender.evaluation import evaluate_factors, evaluate_geometry, evaluate_reconstruction, mean_image
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.linear_task import choose_rows
+from derender.evaluation.pixels import evaluate_reconstruction, mean_image
+from derender.evaluation.truth import evaluate_factors, evaluate_geometry
 from derender.features import embed_image_set
 from derender.inputs import as_images, as_model
 from derender.interpretation import explain_labels, question

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
 from derender.features.extract import as_batch
-from derender.interpretation import Explained, Explanation, Probe, tables
-from derender.interpretation import attribution as attributed
-from derender.interpretation.attribution import UNCHANGED
+from derender.interpretation import attribution, tables
+from derender.interpretation.explanation import Explained
+from derender.interpretation.probe import Probe
 from derender.report.charts import INK, SERIES, side_by_side
 from derender.report.colours import Images, pictures
 from derender.report.page import Page
@@ -44,9 +44,9 @@ def overlays(images: Pixels, maps: Float[Tensor, "n y x"]) -> Images:
     if maps.shape[-1] == size:
         side = max(1, round(size / 12.8)) // 2 * 2 + 1  # single pixels say little
         how = {"stride": 1, "padding": side // 2, "count_include_pad": False}
-        heat = attributed.to_one(torch.nn.functional.avg_pool2d(maps[:, None], side, **how)[:, 0])
+        heat = attribution.to_one(torch.nn.functional.avg_pool2d(maps[:, None], side, **how)[:, 0])
     else:
-        heat = attributed.to_one(attributed.upsampled(maps, size))
+        heat = attribution.to_one(attribution.upsampled(maps, size))
     heat, grey = heat.cpu().numpy()[..., None], images.mean(dim=1).cpu().numpy()[..., None]
     blended = grey * (1 - STRENGTH * heat) + colormaps["inferno"](heat[..., 0])[..., :3] * STRENGTH * heat
     return pictures(np.moveaxis(blended, -1, 1))
@@ -58,10 +58,10 @@ def saliency_sheet(
     """One row for each image: the input and its answer, then each factor's map and share of |IG|."""
     with torch.no_grad():
         features = {name: code.float().cpu().numpy() for name, code in model.embed(images).items()}
-    attribution, _ = attributed.integrated_gradients(probe, probe.columns(features), target)
-    shares, answers = attributed.factor_shares(attribution, probe), probe.probabilities(features)[:, target]
+    gradients, _ = attribution.integrated_gradients(probe, probe.columns(features), target)
+    shares, answers = attribution.factor_shares(gradients, probe), probe.probabilities(features)[:, target]
     targets = [target] * len(images)
-    maps = (attributed.saliency(method, model, images, name, probe, targets) for name in probe.factors)
+    maps = (attribution.saliency(method, model, images, name, probe, targets) for name in probe.factors)
     columns = [pictures(images), *(overlays(images, drawn) for drawn in maps)]
     captions = []
     for answer, row in zip(answers, shares, strict=True):
@@ -77,7 +77,7 @@ def draw_maps(
     labels: int = 3,
     rows: int = 6,
     progress: Callable[[int, int], object] | None = None,
-) -> tuple[dict[str, dict[str, Image.Image]], list[attributed.Similarity]]:
+) -> tuple[dict[str, dict[str, Image.Image]], list[attribution.Similarity]]:
     """Sheets for so many labels with the highest AUC, and the sanity check of the maps on the first of them.
 
     A sheet has ``rows`` held-out images with the label; ``progress`` is called with (labels done, in all).
@@ -87,7 +87,7 @@ def draw_maps(
     auc = np.nan_to_num(shares.rows[0].auc.mean(axis=0), nan=-1)
     best = [int(at) for at in np.argsort(-auc, kind="stable") if (targets[test, at] == 1).sum() >= 2][:labels]
     sheets: dict[str, dict[str, Image.Image]] = {}
-    checks: list[attributed.Similarity] = []
+    checks: list[attribution.Similarity] = []
     for place, target in enumerate(best):
         carriers = test[targets[test, target] == 1]
         chosen = np.random.default_rng(0).permutation(carriers)[:rows]
@@ -95,16 +95,16 @@ def draw_maps(
         name = shares.names[target]
         made = sheets[name] = {
             method: saliency_sheet(model, probe, batch, target, method, f"{name}: {method}")
-            for method in attributed.METHODS
+            for method in attribution.METHODS
         }
         if not checks:
             asked = np.full(len(batch), target)
-            checks = attributed.sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
+            checks = attribution.sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
             fresh, title = untrained_twin(model, 0), f"{name}: grad-cam with fresh weights"
             made["fresh weights"] = saliency_sheet(fresh, probe, batch, target, "grad-cam", title)
             columns = {"input": pictures(batch)}
             for factor in shares.factors:
-                seen = attributed.saliency("grad-cam", model, batch, factor)  # without a question
+                seen = attribution.saliency("grad-cam", model, batch, factor)  # without a question
                 columns[factor] = overlays(batch, seen)
             made["feature"] = labelled_grid(columns, title="the feature itself", layout=LAYOUT)
         if progress is not None:
@@ -165,20 +165,20 @@ def explanation_page(
         shown = zip(pictures(images.images[rows]), pair[0], strict=True)
         faces = [(face, f"the image {name}", name) for face, name in shown]
     values = {
-        "shares": share_values(shares, chart), "sheets": sheets, "unchanged": UNCHANGED, "tables": tables,
-        "checks": checks, "clusters": explained.clusters, "pair": pair, "faces": faces,
+        "shares": share_values(shares, chart), "sheets": sheets, "unchanged": attribution.UNCHANGED,
+        "tables": tables, "checks": checks, "clusters": explained.clusters, "pair": pair, "faces": faces,
     }  # fmt: skip
     lead = f"{explained.model.source or 'a model'} on {images.source}: {asked}."
     return Page("explanation.html", "Which factor made the answer", lead, values)
 
 
-def share_values(result: Explanation, chart: str) -> dict[str, Any]:
+def share_values(result: tables.Explanation, chart: str) -> dict[str, Any]:
     """What ``templates/shares.html`` shows: verdicts, the chart of the shares (SVG text) and their tables."""
     shown = [tables.share_table(result), tables.drop_table(result)]
     return {"verdicts": tables.share_verdicts(result), "chart": chart, "tables": shown}
 
 
-def share_chart(result: Explanation) -> tuple[str, bytes]:
+def share_chart(result: tables.Explanation) -> tuple[str, bytes]:
     """SVG text for a page, and the same as PNG."""
     model, *controls = result.rows
     places = np.arange(len(result.names))[::-1]

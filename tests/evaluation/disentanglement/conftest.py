@@ -3,7 +3,10 @@
 import numpy as np
 
 from derender.evaluation import disentanglement as scored
-from derender.evaluation.disentanglement import DisentanglementCard, FeatureScores, SwapScores, TrueFactor
+from derender.evaluation.disentanglement.card import DisentanglementCard, FeatureScores
+from derender.evaluation.disentanglement.ground_truth import TrueFactor
+from derender.evaluation.disentanglement.similarity import correlation_matrix
+from derender.evaluation.disentanglement.swap import SwapScores
 
 NAMES = ("light", "camera")
 MOVED = np.array([[0.9, 0.3], [0.1, 0.7]])
@@ -25,4 +28,4 @@ def card(seeds: int = 2, known: bool = True) -> DisentanglementCard:
         "model": [scores(blocks, seed, True) for seed in range(seeds)],
         "shuffled rows": [scores(noise, seed, False) for seed in range(seeds)],
     }
-    return DisentanglementCard(NAMES, rows, scored.correlation_matrix(blocks), (1, 1), 80)
+    return DisentanglementCard(NAMES, rows, correlation_matrix(blocks), (1, 1), 80)

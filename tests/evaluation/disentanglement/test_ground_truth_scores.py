@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from sklearn.metrics import mutual_info_score
 
-from derender.evaluation.disentanglement import TrueFactor, dci, ground_truth_scores, importance
-from derender.evaluation.disentanglement.ground_truth import mutual_information, true_factors
+from derender.evaluation.disentanglement import dci, ground_truth_scores, importance, mutual_information
+from derender.evaluation.disentanglement.ground_truth import TrueFactor, true_factors
 
 RNG = np.random.default_rng(0)
 ROWS = 600

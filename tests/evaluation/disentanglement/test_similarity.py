@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from derender.evaluation.disentanglement import correlation_matrix, linear_cka, pearson, similarity
-from derender.evaluation.disentanglement.similarity import held_out
+from derender.evaluation.disentanglement import linear_cka, pearson, similarity
+from derender.evaluation.disentanglement.similarity import correlation_matrix, held_out
 
 
 def features(rows: int = 40, size: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
@@ -45,7 +45,7 @@ def test_dead_dimensions_and_constant_vectors_are_left_out_and_counted():
 
 @pytest.mark.parametrize("score", [pearson, similarity, correlation_matrix])
 def test_bad_input(score):
-    with pytest.raises(ValueError, match="feature 'b': 6 of 6 rows are not finite"):
+    with pytest.raises(ValueError, match="factor 'b' is not finite in 6 of 6 rows, first in row 0"):
         score({"a": np.ones((6, 2)), "b": np.full((6, 2), np.inf)})
     blocks = features()
     with pytest.raises(ValueError, match=r"two or more of one number of rows.*got 1 features of \[40\]"):

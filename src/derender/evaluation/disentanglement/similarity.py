@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from derender.features.table import check_finite
+
 PENALTIES = tuple(10.0**power for power in range(-7, 3))
 
 
@@ -143,11 +145,7 @@ def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             f"scores between features need two or more of one number of rows, 4 or more; got {len(blocks)} "
             f"features of {lengths} rows"
         )
-    for name, values in blocks.items():
-        if bad := int((~np.isfinite(values)).any(axis=1).sum()):
-            raise ValueError(
-                f"feature {name!r}: {bad} of {len(values)} rows are not finite: drop them or check the model"
-            )
+    check_finite(blocks, [f"row {row}" for row in range(lengths[0])])
     return blocks
 
 

@@ -23,9 +23,9 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.evaluation.bootstrap import RESAMPLES, resamples
-from derender.features import evaluating
 from derender.scene import Scene
 from derender.scene.perturb import derangement
+from derender.training.process import evaluating
 from derender.training.step import fill_uncovered
 
 
@@ -60,7 +60,7 @@ def encodings(
 ) -> Encodings:
     """Of (N, 3, H, W) uint8 images, or of the renderings of scenes, filled from the images."""
     parts = []
-    with evaluating(model):
+    with evaluating(model), torch.inference_mode():
         for start in range(0, len(images), batch_size):
             rows = slice(start, start + batch_size)
             pixels = as_float(images[rows]).to(model.device)
