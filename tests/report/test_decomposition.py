@@ -1,7 +1,6 @@
 """Images show what the values say: sizes, labels, one scale for a set, normals, transparency."""
 
 from dataclasses import replace
-from functools import partial
 from math import radians
 
 import numpy as np
@@ -9,15 +8,14 @@ import pytest
 import torch
 from PIL import Image, ImageDraw
 
-from derender.render import render_scene
+from derender.model import Derenderer
 from derender.report import colours, panel
 from derender.report import decomposition as drawing
 from derender.report.decomposition import COLUMN_MEANING, decomposition
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid
 from derender.scene import Scene
 
-FOV_DEG = 10.0
-render = partial(render_scene, fov_deg=FOV_DEG)
+MODEL = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
 
 
 def bump(count: int = 3, size: int = 16) -> Scene:
@@ -34,7 +32,7 @@ def bump(count: int = 3, size: int = 16) -> Scene:
 def test_every_column_is_drawn_and_a_further_factor_where_its_parameter_is_a_map():
     extra = {"gloss": torch.rand(3, 16, 16), "tint": torch.rand(3, 3, 16, 16), "age": torch.rand(3, 2)}
     scene = replace(bump(), extra=extra)
-    drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
+    drawn = decomposition(MODEL, MODEL.render(scene).image.clamp(0, 1), scene)
     assert list(drawn.columns) == [*COLUMN_MEANING, "gloss", "tint"]
     assert all([image.size for image in images] == [(16, 16)] * 3 for images in drawn.columns.values())
 
@@ -43,7 +41,7 @@ def test_panel_has_the_expected_size_and_labels(monkeypatch):
     written, pen, text = [], ImageDraw.ImageDraw, ImageDraw.ImageDraw.text
     monkeypatch.setattr(pen, "text", lambda *all, **more: written.append(all[2]) or text(*all, **more))
     scene = bump()
-    drawn = decomposition(render(scene).image.clamp(0, 1), scene, render, FOV_DEG)
+    drawn = decomposition(MODEL, MODEL.render(scene).image.clamp(0, 1), scene)
     layout = GridLayout(cell=90, gap=10, margin=20, label=12)
     one = labelled_grid({name: images[1:2] for name, images in drawn.columns.items()}, layout=layout)
     assert written == list(COLUMN_MEANING)
@@ -60,14 +58,6 @@ def test_contact_sheet_and_pairs():
     layout = GridLayout(cell=20, gap=5, margin=10, label=10)
     assert contact_sheet(images, across=3, layout=layout).size == (10 + 3 * 25 - 5 + 10, 10 + 2 * 25 - 5 + 10)
     assert contact_sheet(images, ["x"] * 5, across=3, layout=layout).height == 10 + 2 * (25 + 15) - 5 + 10
-    with pytest.raises(ValueError, match="at least one image"):
-        contact_sheet([])
-    with pytest.raises(ValueError, match="expected 5 captions"):
-        contact_sheet(images, ["x"])
-    with pytest.raises(ValueError, match="expected 1 row labels"):
-        labelled_grid({"a": images[:1]}, ["x", "y"])
-    with pytest.raises(ValueError, match="same number of images"):
-        labelled_grid({"a": images[:1], "b": images})
 
 
 def test_long_names_are_shortened_in_the_middle_and_kept_on_one_line():

@@ -85,13 +85,9 @@ def test_loops_move_and_close():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: sweeps.stills(1), "2 stills or more"),
-        (lambda: sweeps.there_and_back(1), "2 frames or more"),
         (lambda: sweeps.lights_around(sweeps.stills(2), 90), "reach must lie between -90 and 90"),
         (lambda: sweeps.lights_around(sweeps.stills(2), 9, strength=-1), "strength of a light must be 0"),
         (lambda: sweeps.cameras_around(sweeps.stills(2), 10, 95), "pitch must lie between"),
-        (lambda: sweeps.swapped(ball(), ball()[[0, 0]], "light"), "takes from one scene, got 2"),
-        (lambda: sweeps.nodding_view(ball()[[0, 0]]), "one scene"),
     ],
 )
 def test_bad_sweeps(call, message):

@@ -1,15 +1,10 @@
 """`derender decompose` and `mesh`: each image as its factors, and as a surface for other programs."""
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, opener_of, option
 from derender.report.options import MESH_FORMATS, MESH_SIZE, TEXTURE_SIZE, ImageOptions
 from derender.storage.places import require_known
-
-if TYPE_CHECKING:
-    from derender.report.mesh import MeshFiles
-    from derender.report.opening import OpenedImage
 
 
 @command("decompose", "decompose --model runs/faces me.jpg you.png --out apart/")
@@ -32,11 +27,8 @@ def mesh(
 ) -> None:  # fmt: skip
     """Write a folder per image with its surface as a mesh: its pixels as texture, x right, y up."""
     require_known("format", form, MESH_FORMATS)
-    from derender.report.mesh import MeshFiles, image_mesh
+    from derender.report.mesh import image_mesh
 
     opener = opener_of(model, how, MESH_SIZE if how.detail == "model" else TEXTURE_SIZE)
-
-    def edit(image: "OpenedImage") -> "MeshFiles":
-        return MeshFiles(image_mesh(opener.model, image, grazing), form)
-
+    edit = partial(image_mesh, opener.model, grazing_deg=grazing, form=form)
     files.edit(opener, edit, output, sheet=False)

@@ -49,8 +49,6 @@ T = TypeVar("T")
 
 def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str) -> str:
     """Lines by name, each (x values, y values), as SVG text."""
-    if not series:
-        raise ValueError("a chart needs at least one series")
 
     def draw(axes: Axes, _: object) -> None:
         for (name, (x, y)), colour in zip(series.items(), cycle(SERIES), strict=False):
@@ -94,8 +92,6 @@ def side_by_side(
 
     A legend of the first panel's labels has at most so many columns.
     """
-    if not panels:
-        raise ValueError("a chart needs at least one panel")
     figure = Figure(figsize=size, layout="constrained")
     drawn = list(figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0])
     for axes, (title, value) in zip(drawn, panels.items(), strict=True):
@@ -183,8 +179,6 @@ def write_card(card: DisentanglementCard, title: str, file: Path) -> None:
 
 def matrix_sheet(matrices: Sequence[Matrix], title: str = "") -> Image.Image:
     """All matrices on one white sheet; a matrix that is much wider than high takes a row of its own."""
-    if not matrices:
-        raise ValueError("a sheet needs at least one matrix")
     wide = [matrix for matrix in matrices if matrix.values.shape[1] >= 1.6 * matrix.values.shape[0]]
     square = [matrix for matrix in matrices if matrix not in wide]
     heights = [3.9] * -(-len(square) // ACROSS) + [3.4] * len(wide)

@@ -84,11 +84,11 @@ def _images(colours: np.ndarray, mask: Values | None) -> Images:
     return [Image.fromarray(np.ascontiguousarray(row)) for row in pixels]
 
 
-def on_background(image: Image.Image, background: tuple[int, int, int] = (255, 255, 255)) -> Image.Image:
-    """An opaque RGB copy, transparent parts filled with ``background``."""
+def on_background(image: Image.Image) -> Image.Image:
+    """An opaque RGB copy, white where the image is transparent."""
     if image.mode != "RGBA":
         return image.convert("RGB")
-    filled = Image.new("RGB", image.size, background)
+    filled = Image.new("RGB", image.size, "white")
     filled.paste(image, mask=image.getchannel("A"))
     return filled
 

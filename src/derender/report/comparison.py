@@ -25,11 +25,8 @@ def comparison_page(
     ``facts`` are models, data, seeds, settings; ``failed`` has a sentence for whatever is missing, with the
     reason.
     """
-    if not tables:
-        raise ValueError("a comparison needs at least one table")
-    drawn = [chart_of(table) for table in tables]
     settings = {**(facts or {}), "derender": __version__}
-    shown = list(zip(tables, drawn, strict=True))
+    shown = [(table, chart_of(table)) for table in tables]
     return Page("comparison.html", title, lead, {"tables": shown, "failed": failed, "settings": settings})
 
 

@@ -6,8 +6,8 @@ parameters and normals as the renderer takes them, ``scene.json`` light and came
 """
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from math import degrees, radians
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,10 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import Derenderer
-from derender.networks import Factor
-from derender.render import Rendering
 from derender.renderers import Renderer
 from derender.report import colours
 from derender.report.opening import OpenedImage
-from derender.report.panel import labelled_grid, strip
+from derender.report.panel import labelled_grid
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.scene.normals import normals_from_depth
@@ -51,10 +49,8 @@ class Decomposition:
     # column name to N images, in the order of a panel: those of ``COLUMN_MEANING``, then the renderer's own,
     # then further factors whose parameter is a map
     columns: Mapping[str, colours.Images]
-    scene: Scene  # the N scenes
-    fov_deg: float  # horizontal field of view
-    # rows of further factors whose parameter is a few named numbers, by parameter
-    numbers: Mapping[str, Factor] = field(default_factory=dict)
+    scene: Scene  # the N scenes, on the CPU
+    model: Derenderer  # made and drew them
 
     def sheet(self) -> Image.Image:
         """One labelled panel with a row for every image."""
@@ -69,50 +65,47 @@ class Decomposition:
         """Write the first image's files; returns the content of its scene.json."""
         scene = self.scene[0].detach()
         named = {
-            row.name: {one.name: value for one, value in zip(row.numbers, values, strict=True)}
-            for row in self.numbers.values()
+            row.name: dict(zip((one.name for one in row.numbers), values, strict=True))
+            for row in self.model.factors
+            if row.numbers
             for values in scene.parameters[row.parameter].tolist()
         }
         written = {**record, **scene_numbers(scene), **named}
         labelled_grid({name: [image] for name, image in self.row.items()}).save(folder / "panel.png")
         for name, image in self.row.items():
-            strip([image]).save(folder / f"{name.replace(' ', '_')}.png")
+            image.convert("RGBA").save(folder / f"{name.replace(' ', '_')}.png")
         text = json.dumps(written, indent=1, ensure_ascii=False)
         (folder / "scene.json").write_text(text, encoding="utf-8", errors="backslashreplace")
         values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in scene.parameters.items()}
-        values["normal"] = normals_from_depth(scene.depth, self.fov_deg)[0].cpu().numpy()
+        values["normal"] = normals_from_depth(scene.depth, self.model.fov_deg)[0].cpu().numpy()
         np.savez_compressed(folder / "scene.npz", **values)
         return written
 
 
 def decomposition(
+    model: Derenderer,
     images: Float[Tensor, "n 3 h w"],
     scene: Scene,
-    render: Callable[[Scene], Rendering],
-    fov_deg: float,
     depth_range: tuple[float, float] | None = None,
-    model: Derenderer | None = None,
 ) -> Decomposition:
-    """Draw the scenes of ``images`` (0..1); ``render`` is ``model.render`` or the plain renderer.
+    """Draw the scenes of ``images`` (0..1), as the model's renderer does.
 
     ``depth_range`` is the nearest and farthest depth of the colour scale; by default that of these scenes.
-    The renderer of ``model``, by default ``lambert``, draws shading and its own columns.
     """
-    scene = scene.detach()
+    scene, renderer = scene.detach(), model.renderer
+    shown = (scene, under_another_light(scene), from_another_view(scene))
     with torch.no_grad():
-        own, relit, rotated = map(render, (scene, under_another_light(scene), from_another_view(scene)))
-    renderer = Renderer("lambert") if model is None else model.renderer
+        own, relit, rotated = map(model.render, shown)
     columns = {
         "input": colours.pictures(images),
         "reconstruction": colours.pictures(own.image, own.mask),
-        **factor_images(scene, renderer, fov_deg, depth_range),
+        **factor_images(scene, renderer, model.fov_deg, depth_range),
         "another light": colours.pictures(relit.image, relit.mask),
         "another view": colours.pictures(rotated.image, rotated.mask),
     }
     columns |= {title: columns.pop(title) for title in renderer.maps}  # the renderer's own come last
     further = {name: drawn for name, value in scene.extra.items() if (drawn := colours.any_maps(value))}
-    numbers = {} if model is None else {row.parameter: row for row in model.factors if row.numbers}
-    return Decomposition({**columns, **further}, scene.to("cpu"), fov_deg, numbers)
+    return Decomposition({**columns, **further}, scene.to("cpu"), model)
 
 
 @torch.no_grad()
@@ -133,7 +126,7 @@ def decompose_images(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> Dec
     """Decompose images (0..1) and draw the result."""
     with torch.no_grad():
         scene = model.decompose(images)
-    return decomposition(images, scene, model.render, model.fov_deg, model=model)
+    return decomposition(model, images, scene)
 
 
 def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
@@ -142,8 +135,7 @@ def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
     if detail is not None:
         albedo = detail.on_grid(detail.albedo(), detail.size)
         scene = at_size(scene, detail.size).with_parameters(albedo=albedo)
-    pixels = as_float(image.pixels[None])
-    return decomposition(pixels, scene, model.render, model.fov_deg, image.depth_range, model)
+    return decomposition(model, as_float(image.pixels[None]), scene, image.depth_range)
 
 
 def scene_numbers(scene: Scene) -> dict[str, Any]:

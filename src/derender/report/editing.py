@@ -1,7 +1,7 @@
 """Edit images and write the results: what the image commands do, as one library call.
 
 An edit makes of an opened image what is written for it: a ``Decomposition``, an ``Edit`` (relit, rotated,
-swapped) or ``MeshFiles``. Each image has a folder, which appears whole or not at all. An image that cannot be
+swapped) or a ``Mesh``. Each image has a folder, which appears whole or not at all. An image that cannot be
 read is left out and listed; the others are written. Leaves out opening (``opening``) and the edits
 (``decomposition``, ``edits``, ``mesh``).
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -24,6 +24,9 @@ from derender.photo import edit_video, is_video
 from derender.photo.faces import TEMPLATES
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
+from derender.report.decomposition import Decomposition
+from derender.report.edits import Edit
+from derender.report.mesh import Mesh
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
@@ -39,17 +42,8 @@ NAMED = 5
 """So many images that cannot be read are named."""
 
 
-class Edited(Protocol):
-    """What can be written for one image."""
-
-    @property
-    def row(self) -> Mapping[str, Image.Image]:
-        """Its row of a sheet over all images; empty for none."""
-        ...
-
-    def write(self, folder: Path, record: dict[str, Any], /) -> dict[str, Any]:
-        """Write its files to ``folder``; returns the record with what was written."""
-        ...
+Edited = Decomposition | Edit | Mesh
+"""Each has ``row``, its cells of a sheet over all images, and ``write``, which adds its files to a record."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,26 @@ class Mesh:
     faces: Int64[np.ndarray, "f 3"]  # (F, 3) vertex numbers, counter-clockwise seen from outside
     texture: Image.Image  # albedo, first row at the top
     trimmed: float  # share of the grid's cells that were left out, 0..1
+    form: str = "glb"  # of the files that `write` makes, one of ``MESH_FORMATS``
+
+    @property
+    def row(self) -> dict[str, Image.Image]:
+        """Empty: meshes have no sheet."""
+        return {}
+
+    def write(self, folder: Path, record: dict[str, Any]) -> dict[str, Any]:
+        """Write the files; returns their names and the mesh's size."""
+        home = Path(record["folder"])
+        files = self.files(home.name, self.form)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+        return {
+            **record,
+            "files": [home / name for name in files],
+            "vertices": len(self.vertices),
+            "faces": len(self.faces),
+            "trimmed": self.trimmed,
+        }
 
     def files(self, name: str, form: str = "glb") -> dict[str, bytes]:
         """File name to content: ``NAME.glb``, or ``NAME.obj``, ``NAME.mtl`` and ``NAME.png``.
@@ -84,33 +104,6 @@ class Mesh:
         return {f"{name}.obj": text.encode(), **more}
 
 
-@dataclass(frozen=True)
-class MeshFiles:
-    """A mesh to be written in one format; what an edit of an image is to ``editing``."""
-
-    mesh: Mesh
-    form: str = "glb"
-
-    @property
-    def row(self) -> dict[str, Image.Image]:
-        """Empty: meshes have no sheet."""
-        return {}
-
-    def write(self, folder: Path, record: dict[str, Any]) -> dict[str, Any]:
-        """Write the files; returns their names and the mesh's size."""
-        home = Path(record["folder"])
-        files = self.mesh.files(home.name, self.form)
-        for name, content in files.items():
-            (folder / name).write_bytes(content)
-        return {
-            **record,
-            "files": [home / name for name in files],
-            "vertices": len(self.mesh.vertices),
-            "faces": len(self.mesh.faces),
-            "trimmed": self.mesh.trimmed,
-        }
-
-
 def model_mesh(
     model: Derenderer,
     scene: Scene,
@@ -134,12 +127,13 @@ def model_mesh(
     return replace(mesh, uv=uv.astype(np.float32), texture=pictures(texture)[0])
 
 
-def image_mesh(model: Derenderer, image: OpenedImage, grazing_deg: float = GRAZING_DEG) -> Mesh:
+def image_mesh(model: Derenderer, image: OpenedImage, grazing_deg: float, form: str) -> Mesh:
     """The mesh of an opened image, with its own pixels as texture where those are drawn."""
-    if (detail := image.detail) is None:
-        return model_mesh(model, image.scene, grazing_deg)
-    scene = at_size(image.scene, max(MESH_SIZE, model.image_size))
-    return model_mesh(model, scene, grazing_deg, detail.albedo())
+    scene, texture = image.scene, None
+    if image.detail is not None:
+        scene = at_size(scene, max(MESH_SIZE, model.image_size))
+        texture = image.detail.albedo()
+    return replace(model_mesh(model, scene, grazing_deg, texture), form=form)
 
 
 def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: float = GRAZING_DEG) -> Mesh:
@@ -153,12 +147,10 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
             rest of the surface encloses.
 
     Raises:
-        ValueError: there are several scenes, or nothing of the surface is left.
+        ValueError: nothing of the surface is left.
     """
     if not 0 < grazing_deg <= 90:
         raise ValueError(f"grazing must lie above 0 and up to 90 degrees, got {grazing_deg:g}")
-    if len(scene) != 1:
-        raise ValueError(f"a mesh shows one scene, got {len(scene)}: pass scene[index]")
     depth = scene.depth.detach().double().cpu()
     height, width = depth.shape[1:]
     points = unproject(depth, fov_deg)[0]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from derender.evaluation.memory import content_hash
 from derender.evaluation.robust import SCORES, CurveResult, RobustnessComparison, level_name
@@ -22,7 +22,7 @@ from derender.report import colours
 from derender.report.charts import SERIES, side_by_side
 from derender.report.colours import Images
 from derender.report.page import png_bytes
-from derender.report.panel import INK, PAPER, GridLayout, labelled_grid, shortened
+from derender.report.panel import PAPER, GridLayout, contact_sheet, labelled_grid
 from derender.storage.atomic import write_whole
 
 CONTROL_LINES = ((0, (5, 2)), (0, (1, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)))
@@ -104,7 +104,8 @@ def segmentation_sheet(
     for name, shown in {"mask": masks, **answers}.items():
         columns[name] = overlays(pictures, shown, len(classes), scale=scale)
     grid = labelled_grid(columns, layout=layout)
-    key = legend(classes, grid.width, layout)
+    swatches = [Image.new("RGB", (8, 1), tuple(colour)) for colour in palette(len(classes)).tolist()]
+    key = contact_sheet(swatches, classes, across=len(columns), layout=layout)
     sheet = Image.new("RGB", (grid.width, grid.height + key.height), PAPER)
     sheet.paste(grid, (0, 0))
     sheet.paste(key, (0, grid.height))
@@ -118,22 +119,6 @@ def write_overlays(result: SegmentationComparison, out: Path) -> Path:
     sheet = segmentation_sheet(images, truth, answers, result.data.classes)
     mark = content_hash({"pictures": images, "mask": truth, **answers})[:8]
     return write_whole(out / f"overlays-{mark}.png", png_bytes(sheet))
-
-
-def legend(classes: Sequence[str], width: int, layout: GridLayout) -> Image.Image:
-    """A swatch and a name for each class, in as many columns as fit into ``width`` pixels."""
-    font, gap, margin = ImageFont.load_default(layout.label), layout.gap, layout.margin
-    swatch, widest = layout.label + 4, max(ceil(font.getlength(name)) for name in classes)
-    cell = min(swatch + 3 * gap + widest, width - 2 * margin)
-    across = max(1, (width - 2 * margin) // cell)
-    key = Image.new("RGB", (width, ceil(len(classes) / across) * (swatch + gap) + margin), PAPER)
-    draw = ImageDraw.Draw(key)
-    for number, (name, colour) in enumerate(zip(classes, palette(len(classes)).tolist(), strict=True)):
-        x, y = margin + number % across * cell, number // across * (swatch + gap)
-        draw.rectangle((x, y, x + swatch, y + swatch), fill=tuple(colour))
-        room = max(1, cell - swatch - 2 * gap)
-        draw.text((x + swatch + gap, y + swatch // 2), shortened(name, font, room), INK, font, anchor="lm")
-    return key
 
 
 def _larger(images: np.ndarray, scale: int) -> Images:

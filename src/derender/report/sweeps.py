@@ -35,15 +35,11 @@ Render = Callable[[Scene], Rendering]
 
 def stills(count: int) -> Float[Tensor, " k"]:
     """``count`` places, evenly from 0 to 1."""
-    if count < 2:
-        raise ValueError(f"a strip needs 2 stills or more, got {count}")
     return torch.linspace(0, 1, count)
 
 
 def there_and_back(frames: int) -> Float[Tensor, " k"]:
     """Places of a film that goes smoothly from 0 to 1 and back; the last frame leads to the first."""
-    if frames < 2:
-        raise ValueError(f"a film needs 2 frames or more, got {frames}")
     return (1 - _angles(frames).cos()) / 2
 
 
@@ -71,8 +67,6 @@ def cameras_around(t: Float[Tensor, " k"], reach_deg: float, pitch_deg: float = 
 
 def varied(scene: Scene, **parameters: Tensor) -> Scene:
     """One scene once for each row of the given parameters, with those in place of its own."""
-    if len(scene) != 1:
-        raise ValueError(f"a sweep shows one scene, got {len(scene)}: pass scene[index]")
     count = len(next(iter(parameters.values())))
     repeated = scene.detach().map(lambda value: value.expand(count, *value.shape[1:]))
     return repeated.with_parameters(**{name: value.to(scene.depth) for name, value in parameters.items()})
@@ -80,8 +74,6 @@ def varied(scene: Scene, **parameters: Tensor) -> Scene:
 
 def swapped(scene: Scene, donor: Scene, parameter: str) -> Scene:
     """The scenes with one parameter (depth, albedo, light, camera) of a single other scene."""
-    if len(donor) != 1:
-        raise ValueError(f"a swap takes from one scene, got {len(donor)}: pass donor[index]")
     value = named(donor.parameters, parameter, "parameter")
     return scene.with_parameters(**{parameter: value.expand(len(scene), *value.shape[1:])})
 
@@ -147,7 +139,7 @@ def _around(t: Tensor, reach_deg: float, pitch_deg: float) -> tuple[Tensor, Tens
 def animated_png(frames: Images) -> bytes:
     """An endless loop as the bytes of an animated PNG."""
     # disposal=1: each frame starts from an empty canvas, since frames have transparent parts
-    return _animated(frames, "PNG", round(2400 / max(1, len(frames))), disposal=1)
+    return _animated(frames, "PNG", round(2400 / len(frames)), disposal=1)
 
 
 def gif(frames: Images, seconds: float = 2.4) -> bytes:
@@ -158,12 +150,11 @@ def gif(frames: Images, seconds: float = 2.4) -> bytes:
     flat = {id(frame): frame for frame in frames}  # on the way back frames come again
     for key, frame in flat.items():
         flat[key] = on_background(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG).copy()
-    frame_ms = 10 * max(2, round(100 * seconds / max(1, len(frames))))
+    frame_ms = 10 * max(2, round(100 * seconds / len(frames)))
     return _animated([flat[id(frame)] for frame in frames], "GIF", frame_ms, optimize=False)
 
 
 def _animated(frames: Images, form: str, frame_ms: int, **settings: Any) -> bytes:
-    _enough(frames)
     stream = BytesIO()
     first, *rest = frames
     first.save(stream, format=form, save_all=True, append_images=rest, duration=frame_ms, loop=0, **settings)
@@ -175,7 +166,6 @@ def mp4(frames: Images, seconds: float = 2.4) -> bytes:
 
     A computer without ffmpeg is an error that names the alternative.
     """
-    _enough(frames)
     width, height = frames[0].size
     odd = (0, 0, width % 2, height % 2)
     on_white = (np.asarray(ImageOps.expand(on_background(frame), odd, "white")) for frame in frames)
@@ -190,8 +180,3 @@ def mp4(frames: Images, seconds: float = 2.4) -> bytes:
 
 
 FILMS = {"gif": gif, "mp4": mp4}
-
-
-def _enough(frames: Images) -> None:
-    if len(frames) < 2:
-        raise ValueError(f"a film needs at least two frames; got {len(frames)}")

@@ -11,6 +11,7 @@ address can use the page.
 import errno
 import ipaddress
 import logging
+import os
 import re
 import socket
 from collections.abc import Iterator
@@ -131,26 +132,18 @@ def listen(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise ValueError(f"port must lie in 0..65535, got {port}: 0 takes any free one")
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except OSError as problem:
+        family, *_, address = socket.getaddrinfo(host, port, flags=socket.AI_PASSIVE)[0]
+        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+        return socket.create_server(address, family=family, backlog=128, dualstack_ipv6=both)
+    except socket.gaierror as problem:
         raise ValueError(f"host {host} is no address of this machine: use 127.0.0.1") from problem
-    listener = socket.socket(family, kind, protocol)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen(128)
     except OSError as problem:
-        listener.close()
         reasons = {
             errno.EADDRINUSE: f"port {port} of {host} is in use: choose another port, or 0 for any free one",
             errno.EACCES: f"port {port} needs more rights: choose a port above 1023, or 0",
         }
-        other = f"cannot listen on {host} port {port} ({problem.strerror}): use host 127.0.0.1"
+        other = f"cannot listen on {host} port {port} ({os.strerror(problem.errno or 0)}): use host 127.0.0.1"
         raise ValueError(reasons.get(problem.errno or 0, other)) from problem
-    listener.setblocking(False)
-    return listener
 
 
 def address_of(listener: socket.socket, host: str) -> str:

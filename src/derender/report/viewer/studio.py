@@ -9,9 +9,9 @@ safe for several threads at once: the server gives it one.
 import io
 import json
 import zipfile
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from math import ceil, isfinite
 from typing import Any
 
@@ -78,7 +78,9 @@ class Studio:
     fit_steps: int = 0  # of test-time optimisation of each scene; 0 shows feed-forward scenes
     # how the part of an image is found that the model is given (``photo.found_frame``)
     frame: str | None = None
-    _photographs: OrderedDict[tuple[str, int, bool], Photograph] = field(default_factory=OrderedDict)
+
+    def __post_init__(self) -> None:
+        self._kept_photograph = lru_cache(PHOTOGRAPHS_KEPT)(self._photograph)
 
     def about(self) -> dict[str, Any]:
         """The model's name and abilities, ranges of the camera, examples, table, bound of the shelf."""
@@ -207,7 +209,7 @@ class Studio:
         opened, size = self.shelf.get(question.picture), self._size(question)
         if question.detail == "model":
             return _encoded(Image.fromarray(opened.frame.cut(opened.photo, size).transpose(1, 2, 0)))
-        return _encoded(Image.fromarray(self._photograph(question).pixels))
+        return _encoded(Image.fromarray(self._shown(question).pixels))
 
     def preview(self, question: ViewRequest) -> bytes:
         """The whole photograph, small enough for the page."""
@@ -318,29 +320,24 @@ class Studio:
             if question.detail == "model":
                 return self._rendered(at_size(scene, self._size(question)))
             changed = {name: value for name, value in scene.parameters.items() if name != "albedo"}
-            return Image.fromarray(self._photograph(question).edited(**changed))
+            return Image.fromarray(self._shown(question).edited(**changed))
 
-    def _photograph(self, question: ViewRequest) -> Photograph:
+    def _shown(self, question: ViewRequest) -> Photograph:
         """The photograph that gives the colours, or its part around the crop; the last few are kept."""
-        key = _source(question), self._size(question), question.whole
-        if key not in self._photographs:
-            opened = self.shelf.get(key[0])
-            frame, (height, width) = opened.frame, opened.photo.shape[:2]
-            left, top, right, bottom = 0, 0, width, height
-            if not question.whole:
-                across, down = zip(*frame.widened(MARGIN).corners(), strict=True)
-                left, right = max(0, int(min(across))), min(width, ceil(max(across)))
-                top, bottom = max(0, int(min(down))), min(height, ceil(max(down)))
-            scale = key[1] / max(right - left, bottom - top)
-            pixels = _resized(opened.photo[top:bottom, left:right], scale)
-            place = Frame(
-                (frame.x - left) * scale, (frame.y - top) * scale, frame.side * scale, frame.roll_deg
-            )
-            self._photographs[key] = Photograph.of(pixels, place, opened.scene, self.model)
-        self._photographs.move_to_end(key)
-        while len(self._photographs) > PHOTOGRAPHS_KEPT:
-            self._photographs.popitem(last=False)
-        return self._photographs[key]
+        return self._kept_photograph(_source(question), self._size(question), question.whole)
+
+    def _photograph(self, name: str, size: int, whole: bool) -> Photograph:
+        opened = self.shelf.get(name)
+        frame, (height, width) = opened.frame, opened.photo.shape[:2]
+        left, top, right, bottom = 0, 0, width, height
+        if not whole:
+            across, down = zip(*frame.widened(MARGIN).corners(), strict=True)
+            left, right = max(0, int(min(across))), min(width, ceil(max(across)))
+            top, bottom = max(0, int(min(down))), min(height, ceil(max(down)))
+        scale = size / max(right - left, bottom - top)
+        pixels = _resized(opened.photo[top:bottom, left:right], scale)
+        place = Frame((frame.x - left) * scale, (frame.y - top) * scale, frame.side * scale, frame.roll_deg)
+        return Photograph.of(pixels, place, opened.scene, self.model)
 
     def _rendered(self, scene: Scene) -> Image.Image:
         rendering = self.model.render(scene.to(self.model.device))
