@@ -27,7 +27,7 @@ def test_parameters_are_those_of_our_albedo_net_and_of_the_papers_two_readings()
 
 def test_a_reconstruction_lies_in_range_and_its_error_is_the_mean_square(seeded, losses):
     model = seeded(ae.Autoencoder, SMALL).eval()
-    again = model.shown(IMAGES, None)["reconstruction"]
+    again = model.shown(IMAGES)["reconstruction"]
     assert 0 <= again.min() <= again.max() <= 1
     terms = losses(model, IMAGES, ae.AutoencoderConfig())
     torch.testing.assert_close(terms["reconstruction"], (again - IMAGES).square().mean())
@@ -41,7 +41,7 @@ def test_the_vae_samples_in_training_and_takes_the_mean_otherwise(seeded, losses
     model.eval()
     one, other = (losses(model, IMAGES, ae.BetaVaeConfig(), seed)["l1"].item() for seed in (0, 1))
     assert one == other
-    shown = model.shown(IMAGES, None)["reconstruction"]
+    shown = model.shown(IMAGES)["reconstruction"]
     assert one == pytest.approx((shown - IMAGES).abs().mean().item(), rel=1e-5)
     mean = model.embed(IMAGES)["mean"]
     assert mean.shape == (6, 16) and (mean < 0).any()

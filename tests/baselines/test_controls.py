@@ -36,8 +36,6 @@ def test_pca_takes_its_components_from_other_pictures():
         controls.pca_features(train.select(slice(1)), components=1)
     with pytest.raises(ValueError, match=r"64 components cannot be had from 30 images: ask for 1 to 30"):
         controls.pca_features(train)
-    with pytest.raises(ValueError, match=r"fitted on images \(3, 4, 4\) does not take \(3, 8, 8\)"):
-        controls.pca_features(train, components=4, fit_on=pictures(size=4))
 
 
 def test_an_untrained_twin_has_the_shape_not_the_weights_and_leaves_the_generator():

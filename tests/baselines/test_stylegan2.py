@@ -89,7 +89,7 @@ def test_held_out_images_are_judged_by_samples_of_the_average(model, images, los
     whole, again = (model.sample(3, torch.Generator().manual_seed(5)) for _ in range(2))
     assert whole.shape == (3, 3, 8, 8) and whole.min() >= 0 and whole.max() <= 1
     assert torch.equal(whole, again)
-    assert [column.shape for column in model.shown(whole, None).values()] == 7 * [whole.shape]
+    assert [column.shape for column in model.shown(whole).values()] == 7 * [whole.shape]
 
 
 def test_features_of_the_discriminator_do_not_see_the_batch_but_scores_see_their_group(seeded, generator):

@@ -18,11 +18,11 @@ from urllib.parse import urlsplit
 
 from apart import start
 from hostile_files import Hostile, encoded, named_in, smooth, write_hostile, write_hostile_zip
+from tests.report.viewer.serving import serving
 
 from derender.cli import main
 from derender.model import load
 from derender.report.viewer.app import Application
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
 MEMORY_LIMIT_MB = 3_000

@@ -23,12 +23,12 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from kills import made_material
+from tests.report.viewer.serving import serving
 
 from derender.features.embedding import embed_to_file
 from derender.learn import train
 from derender.model import load
 from derender.report.viewer.app import Application
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
 BOUNDS = {"private_mb": (20.0, 0.03), "descriptors": (4.0, 0.0), "threads": (2.0, 0.0), "files": (2.0, 0.0)}

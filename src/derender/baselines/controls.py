@@ -74,15 +74,10 @@ def pca_features(
     ``fit_on`` gives the components; by default ``images`` themselves. ``seed`` is of the randomised solver.
     """
     source = (images if fit_on is None else fit_on).require(2, "PCA")
-    shape = source.images.shape[1:]
-    limit = min(len(source), int(np.prod(shape)))
+    limit = min(len(source), source.images[0].size)
     if not 1 <= components <= limit:
         raise ValueError(
             f"{components} components cannot be had from {len(source)} images: ask for 1 to {limit}"
-        )
-    if shape != images.images.shape[1:]:
-        raise ValueError(
-            f"PCA fitted on images {shape} does not take {images.images.shape[1:]}: read both at one size"
         )
     pca = PCA(components, whiten=True, random_state=seed).fit(flat_pixels(source.images))
     facts = {"components": components, "whiten": True, "fitted_on": len(source), "seed": seed}

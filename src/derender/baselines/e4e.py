@@ -214,7 +214,7 @@ class E4e(LoopModel):
     def describe(self, images: Images) -> Features:
         return {"w+": self.invert(images).flatten(1)}
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+    def shown(self, images: Images) -> dict[str, Images]:
         again = adaptive_avg_pool2d(self.rebuild(self.invert(images)), images.shape[-1])
         return {"input": images, "inversion": again.clamp(0, 1)}
 

@@ -271,14 +271,8 @@ class Generator(nn.Module):
         return self.mapping(z.to(self.constant))
 
     def w_plus(self, w: Float[Tensor, "n d"] | Codes) -> Codes:
-        """One w for all layers, or W+ as it is; another number or length of codes is a ValueError."""
-        codes, size = self.settings.codes, self.settings.style_size
-        expanded = w[:, None].expand(-1, codes, -1) if w.ndim == 2 else w
-        if tuple(expanded.shape[1:]) != (codes, size):
-            raise ValueError(
-                f"this generator takes w of {size} numbers or W+ of {codes} x {size}, got {(*w.shape[1:],)}"
-            )
-        return expanded
+        """One w for all layers, or W+ as it is."""
+        return w[:, None].expand(-1, self.settings.codes, -1) if w.ndim == 2 else w
 
     def styles(self, w_plus: Codes) -> Styles:
         """Style space of W+."""

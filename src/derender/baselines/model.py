@@ -10,7 +10,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -38,8 +37,6 @@ OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
 Images = Float[Tensor, "n 3 h w"]
 """Images, in 0..1 where nothing else is said."""
 Features = dict[str, Float[Tensor, "n _"]]
-SheetOf = Callable[[Callable[[Any, Tensor], dict[str, Tensor]]], Any]
-"""Makes the loop's drawing function from one that gives images by column."""
 
 
 class BaselineSettings(Settings):
@@ -187,18 +184,14 @@ class LoopModel(BaselineModel):
         """Images in 0..1 through the network; only of networks that make images again."""
         raise NotImplementedError(f"{self.name} makes no images")
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+    def shown(self, images: Images) -> dict[str, Images]:
         """Images for a sample sheet of a run, by column: the input and the network's output."""
         return {"input": images, "reconstruction": self.reconstruct(images)}
 
     @classmethod
-    def train_into(
-        cls, config: Any, images: ImageSet, out: str | Path, *, sample_sheet: SheetOf | None = None,
-        **how: Any,
-    ) -> loop.TrainResult:  # fmt: skip
+    def train_into(cls, config: Any, images: ImageSet, out: str | Path, **how: Any) -> loop.TrainResult:
         """Train in the common loop; see `train_baseline`."""
-        sheet = None if sample_sheet is None else sample_sheet(partial(cls.shown, config=config))
-        return train_task(BaselineTask(config), images, out, sample_sheet=sheet, **how)
+        return train_task(BaselineTask(config), images, out, **how)
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,11 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate, normalize, one
 
 from derender.baselines.e4e import E4e, E4eSettings
 from derender.baselines.generator import TINY, Codes, Maps, StyleLayer
-from derender.baselines.model import BaselineModel, Features, Images, SheetOf, ShortRun
+from derender.baselines.model import BaselineModel, Features, Images, ShortRun
 from derender.data import ImageSet, read_masks, split_indices
 from derender.settings import Settings
 from derender.training.batches import random_stream
-from derender.training.loop import SAMPLE_COUNT
+from derender.training.loop import SAMPLE_COUNT, SampleSheet
 from derender.training.task import TrainResult
 
 COARSE_LAYERS = 4  # styles at 4 and 8 pixels, before the first that paints 8 pixels' colours
@@ -113,7 +113,7 @@ class Ris(BaselineModel):
         own, other = self.styles(images), self.styles(others)
         return self.rebuild(own + self.row(part) * (other - own))
 
-    def shown(self, images: Images, config: Any = None) -> dict[str, Images]:
+    def shown(self, images: Images) -> dict[str, Images]:
         columns = {"input": images, "inversion": self.rebuild(self.styles(images))}
         for part in self.features:
             columns[f"{part} of the next"] = self.swapped(images, images.roll(-1, dims=0), part)
@@ -122,7 +122,7 @@ class Ris(BaselineModel):
 
     @classmethod
     def train_into(
-        cls, config: RisConfig, images: ImageSet, out: str | Path, *, sample_sheet: SheetOf | None = None,
+        cls, config: RisConfig, images: ImageSet, out: str | Path, *, sample_sheet: SampleSheet | None = None,
         resume: bool = False, accelerator: str = "cpu", **how: Any,
     ) -> TrainResult:  # fmt: skip
         """Build a catalogue into a new run folder; see `train_baseline`. No resume."""
@@ -143,7 +143,7 @@ class Ris(BaselineModel):
         channels = {part: float(model.row(part).gt(0).sum()) for part in model.features}
         run.record("train", len(inputs), channels)
         if sample_sheet is not None:
-            sheet = sample_sheet(cls.shown)(model, inputs[:SAMPLE_COUNT])
+            sheet = sample_sheet(model, inputs[:SAMPLE_COUNT])
             sheet.save(run.folder.samples / f"{len(inputs):09d}.png")
         return run.finish(model, len(inputs), channels)
 

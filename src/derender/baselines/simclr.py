@@ -12,7 +12,7 @@ about the grey axis of RGB.
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -164,6 +164,7 @@ class Simclr(LoopModel):
     name, settings_type, config_type = "simclr", SimclrSettings, SimclrConfig
     features = ("features", "projection")
     settings: SimclrSettings
+    run: SimclrConfig  # in which it learns
 
     def __init__(self, settings: SimclrSettings):
         super().__init__(settings)
@@ -174,7 +175,9 @@ class Simclr(LoopModel):
     @classmethod
     def build(cls, config: SimclrConfig) -> "Simclr":
         views_of(config, torch.device("cpu"))  # a model that is missing is an error before there is a folder
-        return cls(config.model)
+        model = cls(config.model)
+        model.run = config
+        return model
 
     @staticmethod
     def prepare(
@@ -186,8 +189,8 @@ class Simclr(LoopModel):
         code = self.encoder(images)
         return {"features": code, "projection": self.head(code)}
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
-        views, generator = views_of(config, images.device), random_stream(config.seed, "perturb", 0)
+    def shown(self, images: Images) -> dict[str, Images]:
+        views, generator = views_of(self.run, images.device), random_stream(self.run.seed, "perturb", 0)
         return {"input": images, **{f"view {n}": views(images, generator) for n in (1, 2, 3, 4)}}
 
     def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ energy distance between them and samples. Leaves out augmentation of the discrim
 from copy import deepcopy
 from itertools import pairwise
 from math import sqrt
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -129,7 +129,7 @@ class Stylegan(LoopModel):
         made = net(net.random_w(count, generator), net.random_noise(count, generator))
         return (made / 2 + 0.5).clamp(0, 1)
 
-    def shown(self, images: Images, config: Any) -> dict[str, Images]:
+    def shown(self, images: Images) -> dict[str, Images]:
         samples = self.sample(SHOWN * len(images), random_stream(0, "perturb", 0)).chunk(SHOWN)
         return {"real": images, **{f"sample {n}": column for n, column in enumerate(samples, 1)}}
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from derender.cli import options, scoring
-from derender.cli.console import notice, progress_bar, refuse_existing, report_images, result
+from derender.cli.console import notice, progress_bar, refuse_existing, report_images
 from derender.cli.options import command, option
 from derender.storage.atomic import require_replaceable
 
@@ -61,5 +61,5 @@ def explain(
     else:
         with progress_bar("drawing maps", "labels") as report:
             results = write_explanation(results, out, sheets=sheets, rows=rows, progress=report)
-        result(f"report {out / 'explain.html'}", published.json_file)
+        published.result(f"report {out / 'explain.html'}")
     published.publish(replace(results.scores, values={**results.scores.values, "out": out}))

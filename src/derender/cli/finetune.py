@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 from derender.cli import scoring
-from derender.cli.console import result
 from derender.cli.options import DataOptions, Device, Settings, command, option
 from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run, run_progress
 
@@ -46,7 +45,7 @@ def finetune(
             images.address, out=out, **images.how, device=device, memory=memory, **how, **vars(choices)
         )
     report_run(made.run)
-    result(f"model {made.run.folder}", published.json_file)
-    result(f"report {out / 'report.html'}", published.json_file)
+    published.result(f"model {made.run.folder}")
+    published.result(f"report {out / 'report.html'}")
     values = {"run": made.run, "report": out / "report.html", "scores": made.scores.values}
     published.publish(replace(made.scores, values=values, notes=[*made.scores.notes, memory.summary()]))

@@ -31,7 +31,6 @@ from derender.storage.places import (
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
-    from derender.report.editing import Edited
     from derender.report.opening import ImageOpener, OpenedImage
 
 MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {', '.join(bundled_models())}."
@@ -250,7 +249,7 @@ class ImageFiles:
         return single_suffix(self.out)
 
     def edit(
-        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: ImageOutput, **how: Any
+        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Any]", output: ImageOutput, **how: Any
     ) -> None:
         """Edit, write and report every image; exit code 2 where one that was named cannot be read.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from derender.cli import options
-from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores, write_json
+from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores
 from derender.cli.options import option
 
 if TYPE_CHECKING:
@@ -70,11 +70,6 @@ class ScoredSubject:
             raise ValueError("--model needs IMAGES to embed")
         return self.model
 
-    @property
-    def how(self) -> dict[str, Any]:
-        """Keywords of library calls."""
-        return {"factors": names_of(self.factors)}
-
 
 @dataclass(frozen=True)
 class Computed:
@@ -87,14 +82,12 @@ class Computed:
 
 
 @dataclass(frozen=True)
-class Published:
-    """Where tables go besides the terminal."""
+class Published(options.Output):
+    """Where numbers and tables go besides the terminal."""
 
-    json_file: options.Json = None
     markdown: str | None = target("Also write the tables as Markdown.")
     latex: str | None = target("Also write the tables as LaTeX (booktabs).")
     html: str | None = target("Also write the tables and charts as one page.")
-    force: options.Force = False
 
     def __post_init__(self) -> None:
         """Refuse, before anything is computed, to write over tables, and into folders."""
@@ -121,7 +114,7 @@ class Published:
             show_scores(table, self.json_file)
         for note in notes:
             notice(note)
-        write_json(self.json_file, values)
+        self.write(values)
         for file, form in ((self.markdown, scores.to_markdown), (self.latex, scores.to_latex)):
             if file is not None:
                 write_whole(file, form())
@@ -146,7 +139,7 @@ def score(
     protocol: str, published: Published, images: options.DataOptions, subject: ScoredSubject, **how: Any
 ) -> None:
     """Score features by a protocol of `derender.evaluation`, and publish."""
-    how |= {"images": images.optional_address, **images.how, **subject.how}
+    how |= {"images": images.optional_address, **images.how, "factors": names_of(subject.factors)}
     published.publish(measured(protocol, subject.source(images), **how), half=images.half)
 
 

@@ -30,20 +30,6 @@ SERIES = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#64748b")
 CONTROL_COLOUR = "#94a3b8"
 INK = "#010203"
 """Becomes currentColor when the SVG text is written: the colour of the page's text, light or dark."""
-_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "derender",
-    "font.family": "sans-serif",
-    "font.size": 10,
-    "text.parse_math": False,  # names of classes and files are no formulas
-    **dict.fromkeys(
-        ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color", "grid.color"), INK
-    ),
-    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
-    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6),
-    "grid.alpha": 0.12,
-    "grid.linewidth": 0.7,
-}
 T = TypeVar("T")
 
 
@@ -79,7 +65,7 @@ def bars(values: Mapping[str, float], x_label: str, highlighted: Sequence[str] =
     return side_by_side({"": None}, draw, x_label, (7.2, 0.6 + 0.34 * len(values)))[0]
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(fname=Path(__file__).with_suffix(".mplstyle"))
 def side_by_side(
     panels: Mapping[str, T],
     draw: Callable[[Axes, T], object],

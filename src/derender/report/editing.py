@@ -24,9 +24,6 @@ from derender.photo import edit_video, is_video
 from derender.photo.faces import TEMPLATES
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
-from derender.report.decomposition import Decomposition
-from derender.report.edits import Edit
-from derender.report.mesh import Mesh
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
@@ -40,10 +37,6 @@ ROWS = ".sheet"
 """Folder of the rows of a sheet, a file for each image, until the sheet is drawn."""
 NAMED = 5
 """So many images that cannot be read are named."""
-
-
-Edited = Decomposition | Edit | Mesh
-"""Each has ``row``, its cells of a sheet over all images, and ``write``, which adds its files to a record."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +98,7 @@ class WrittenImages:
 
 
 def write_images(
-    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
+    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Any], *,
     force: bool = False, sheet: bool | None = None, beside: Sequence[OpenedImage] = (),
     resume: bool = False, video: VideoEdit | None = None, progress: Callable[..., object],
 ) -> WrittenImages:  # fmt: skip
@@ -115,7 +108,8 @@ def write_images(
         opener: a model and how images are read and drawn.
         paths: image files, videos, and folders of them.
         out: folder of the folders.
-        edit: makes of an opened image what is written.
+        edit: makes of an opened image what is written: its ``row`` has the cells of a sheet over all images,
+            ``write`` takes its folder and its record, and returns the record with what was written.
         force: replace what is there, and draw images that do not suit the model.
         sheet: also draw a row for every image as sheet.png; by default for two images or more. With
             ``resume`` it shows those of the interrupted run, too; none is drawn where a row is missing.
@@ -203,7 +197,7 @@ def write_images(
 
 
 def write_image_file(
-    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
+    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Any], *,
     force: bool = False, resume: bool = False, **how: Any,
 ) -> WrittenImages:  # fmt: skip
     """Edit one image, and write a single file of that: the last still, a film, a panel or a mesh.

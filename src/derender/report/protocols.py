@@ -80,8 +80,6 @@ def palette(n_classes: int) -> np.ndarray:
 
 def overlays(pictures: np.ndarray, masks: np.ndarray, n_classes: int, *, scale: int = 1) -> Images:
     """Masks (N, S, S) in colours over images (N, 3, S, S) uint8; every pixel becomes ``scale`` squared."""
-    if pictures.shape != (len(masks), 3, *masks.shape[1:]):
-        raise ValueError(f"images {pictures.shape} and masks {masks.shape} must be of one size and number")
     tints = np.moveaxis(palette(n_classes)[masks], -1, 1)
     mixed = (1 - OPACITY) * pictures.astype(np.float32) + OPACITY * tints
     return _larger(np.rint(mixed).astype(np.uint8), scale)

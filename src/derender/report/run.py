@@ -3,7 +3,7 @@
 With ``evidence`` (data, decompositions, films, scores, card, explanation) the page holds that, too.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from math import isfinite
 from operator import getitem
@@ -27,7 +27,6 @@ from derender.training.config import TrainConfig, setting_names
 from derender.training.run_folder import RunFolder, read_metrics
 
 SHEETS_SHOWN, SHEET_PX, SHEET_PIXEL_LIMIT = 4, 1080, 20_000_000
-Columns = Callable[[Any, Tensor], Mapping[str, Tensor]]
 Metrics = Sequence[Mapping[str, Any]]
 CHARTS = {
     "l1": ("L1", "Mean absolute difference of image and reconstruction, inside the mask if there is one."),
@@ -41,14 +40,10 @@ def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -
     return decompose_images(model, pictures).sheet()
 
 
-def baseline_sheet(columns_of: Columns) -> Callable[[Any, Float[Tensor, "n 3 h w"]], Image.Image]:
-    """A function of a baseline and images (0..1) that draws a row for each image, a column for each kind."""
-
-    def sheet(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
-        columns = columns_of(model, pictures)
-        return labelled_grid({name: colours.pictures(values) for name, values in columns.items()})
-
-    return sheet
+def baseline_sheet(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
+    """What a baseline shows of some images (0..1): a row for each, a column for each kind."""
+    columns = model.shown(pictures)
+    return labelled_grid({name: colours.pictures(values) for name, values in columns.items()})
 
 
 def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:

@@ -62,35 +62,29 @@ def parse_json(content: str | bytes, kind: Any) -> Any:
     return TypeAdapter(kind).validate_json(content, strict=True)
 
 
-class _Measuring(yaml.SafeLoader):
-    """Composes nodes and knows of each the values and levels in it, as often as aliases repeat them."""
-
-    def __init__(self, text: str):
-        super().__init__(text)
-        self.sizes: dict[int, tuple[int, int]] = {}
-        self.level = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        alias, self.level = self.check_event(yaml.AliasEvent), self.level + 1
-        if self.level > DEEPEST:
-            raise ValueError(f"more than {DEEPEST} levels")
-        node = super().compose_node(parent, index)
-        self.level -= 1
-        if id(node) not in self.sizes:
-            if alias:
-                raise ValueError("a value stands inside itself")
-            content = node.value if isinstance(node, yaml.CollectionNode) else ()
-            pairs = (pair if isinstance(pair, tuple) else (pair,) for pair in content)
-            within = [self.sizes[id(one)] for pair in pairs for one in pair]
-            self.sizes[id(node)] = values, levels = (
-                1 + sum(count for count, _ in within),
-                1 + max((depth for _, depth in within), default=0),
-            )
-            if max(values, len(self.sizes)) > MOST_VALUES or levels > DEEPEST:
-                raise ValueError(f"more than {MOST_VALUES:,} values or {DEEPEST} levels")
-            if isinstance(node, yaml.ScalarNode) and len(node.value) > LONGEST_VALUE:
+def _require_small(text: str) -> None:
+    """Raise ValueError where a YAML text has too many values or levels, as often as aliases repeat them."""
+    within = [(None, 0, 0)]  # of each list or mapping that is open: its anchor, values and levels so far
+    sizes: dict[str | None, tuple[int, int]] = {}  # values and levels by anchor
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            within.append((event.anchor, 1, 0))
+        elif isinstance(event, yaml.NodeEvent | yaml.CollectionEndEvent):
+            anchor, values, levels = getattr(event, "anchor", None), 1, 1
+            if isinstance(event, yaml.AliasEvent):
+                if anchor not in sizes:
+                    raise ValueError(f"alias {anchor!r} stands for no value before it")
+                values, levels = sizes[anchor]
+            elif isinstance(event, yaml.CollectionEndEvent):
+                anchor, values, levels = within.pop()
+                levels += 1
+            elif isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_VALUE:
                 raise ValueError(f"a value of more than {LONGEST_VALUE:,} characters")
-        return node
+            sizes[anchor] = values, levels
+            around, before, deepest = within.pop()
+            within.append((around, before + values, max(deepest, levels)))
+        if within[-1][1] > MOST_VALUES or len(within) + within[-1][2] > DEEPEST + 1:
+            raise ValueError(f"more than {MOST_VALUES:,} values or {DEEPEST} levels")
 
 
 def parse_yaml(text: str) -> Any:
@@ -98,9 +92,8 @@ def parse_yaml(text: str) -> Any:
     if len(text) > YAML_LIMIT:
         raise ValueError(f"{len(text):,} characters of YAML are more than {YAML_LIMIT:,}")
     try:
-        loader = _Measuring(text)
-        node = loader.get_single_node()
-        return None if node is None else loader.construct_document(node)
+        _require_small(text)
+        return yaml.safe_load(text)
     except (yaml.YAMLError, LookupError, AttributeError, TypeError, ArithmeticError) as error:
         raise ValueError(first_line(error)) from error
 

@@ -14,10 +14,11 @@ from PIL import Image
 pytest.importorskip("starlette", reason="the viewer's packages are not installed: derender[view]")
 pytest.importorskip("uvicorn", reason="the viewer's packages are not installed: derender[view]")
 
+from tests.report.viewer.serving import serving
+
 from derender import Derenderer
 from derender.report.viewer.app import Application
 from derender.report.viewer.images import Example
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
 SIZE = 32

@@ -11,13 +11,13 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from tests.report.viewer.serving import serving
 
 from derender import Derenderer, load
 from derender.data.synthetic import faces
 from derender.report.viewer.app import Application
 from derender.report.viewer.images import rendered_examples
 from derender.report.viewer.questions import Camera, CropRequest, Light, Place, ViewRequest
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 from derender.scene.crop import Crop
 from derender.scene.ranges import SceneRanges

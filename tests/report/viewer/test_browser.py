@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.report.viewer.serving import serving
 
 from derender import load
 from derender.data.synthetic import faces
@@ -18,7 +19,6 @@ from derender.features import FeatureTable, embed_images
 from derender.model import Derenderer
 from derender.report.viewer.app import Application
 from derender.report.viewer.images import Example, Gallery
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

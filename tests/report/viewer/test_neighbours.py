@@ -3,6 +3,7 @@
 import pytest
 from PIL import Image
 from tests.cli.conftest import noise
+from tests.report.viewer.serving import serving
 
 from derender.data import read_images
 from derender.features import FeatureTable, embed_image_set
@@ -10,7 +11,6 @@ from derender.features.neighbours import nearest
 from derender.report.viewer.app import Application
 from derender.report.viewer.images import Gallery
 from derender.report.viewer.questions import Refused
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
 SIZE = 32

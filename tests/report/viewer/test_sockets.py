@@ -3,10 +3,10 @@
 import socket
 
 import pytest
+from tests.report.viewer.serving import serving
 
 from derender.report.viewer.app import DRAINED_AT_MOST_BYTES, Application
 from derender.report.viewer.questions import BODY_LIMIT_BYTES
-from derender.report.viewer.server import serving
 from derender.report.viewer.studio import Shelf, Studio
 
 CHUNKED = "Transfer-Encoding: chunked\r\n"

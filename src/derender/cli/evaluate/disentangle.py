@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 from derender.cli import options, scoring
-from derender.cli.console import result
 from derender.cli.options import option
 
 
@@ -40,5 +39,5 @@ def disentangle(
         from derender.report.charts import write_card
 
         write_card(scores.result, f"{trained.model}: {len(chosen):,} images", out)
-        result(f"matrices in {out}", published.json_file)
+        published.result(f"matrices in {out}")
     published.publish(scores)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 from derender.cli import options, scoring
-from derender.cli.console import result
 from derender.cli.options import option
 
 PICTURES = "faces or cars: generated. render: IMAGES, re-rendered. truth: IMAGES of known angles."
@@ -55,4 +54,4 @@ def robustness(
         from derender.report.protocols import write_curves
 
         write_curves(scores.result, shown, out)
-        result(f"curves in {out}", published.json_file)
+        published.result(f"curves in {out}")

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from derender.cli import options, scoring
-from derender.cli.console import result
 from derender.cli.options import option
 
 OUT = "Folder for runs (to continue) and overlays."
@@ -38,5 +37,5 @@ def segment(
     if out is not None:
         from derender.report.protocols import write_overlays
 
-        result(f"overlays {write_overlays(scores.result, out)}", published.json_file)
+        published.result(f"overlays {write_overlays(scores.result, out)}")
     published.publish(scores, model=trained.model)

@@ -48,7 +48,6 @@ LONG_WORK = 6
 
 REQUEST_LIMIT_BYTES = 10_000
 
-WAITING_AT_MOST = 200
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
 """So much of a body that is too large is still read and dropped, so that browsers see the answer."""
 
@@ -127,7 +126,6 @@ class Application:
         self.body_seconds, self.work_seconds = body_seconds, work_seconds
         self._computing = ThreadPoolExecutor(1, thread_name_prefix="view-compute")
         self._decoding = ThreadPoolExecutor(1, thread_name_prefix="view-decode")
-        self._waiting = 0
         posts: dict[str, Answer] = {
             "/api/pictures": self.open_upload,
             "/api/examples/{number:int}": self.open_example,
@@ -207,17 +205,12 @@ class Application:
     async def _work(
         self, pool: ThreadPoolExecutor, function: Callable[..., Any], *arguments: Any, patience: int = 1
     ) -> Any:
-        """Have a thread do it, in turn; ``Refused`` (503) if too many wait or it takes too long."""
-        if self._waiting >= WAITING_AT_MOST:
-            raise Refused(503, "too many requests are waiting: try again in a moment")
-        self._waiting += 1
+        """Have a thread do it, in turn; ``Refused`` (503) if it takes too long."""
         try:
             job = asyncio.get_running_loop().run_in_executor(pool, function, *arguments)
             return await asyncio.wait_for(job, patience * self.work_seconds)
         except TimeoutError as late:
             raise Refused(503, "this took too long: try again, or with fewer --fit-steps") from late
-        finally:
-            self._waiting -= 1
 
     async def _question(self, request: Request, kind: type[Question]) -> Question:
         return read_request(kind, await self._receive(request, REQUEST_LIMIT_BYTES))

@@ -14,10 +14,7 @@ import logging
 import os
 import re
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from threading import Thread
 from typing import TYPE_CHECKING
 
 import uvicorn
@@ -59,9 +56,7 @@ class Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                for name, value in SECURITY_HEADERS.items():
-                    headers[name] = value
+                MutableHeaders(scope=message).update(SECURITY_HEADERS)
             await send(message)
 
         refusal = self.refusal(scope["method"], scope["path"], Headers(scope=scope))
@@ -183,19 +178,3 @@ def serve(application: "Application", listener: socket.socket) -> None:
     finally:
         listener.close()
         application.close(wait=False)
-
-
-@contextmanager
-def serving(application: "Application") -> Iterator[str]:
-    """Answer in a thread meanwhile, at any free port; gives the address."""
-    listener = listen("127.0.0.1", 0)
-    server = server_for(application)
-    thread = Thread(target=server.run, kwargs={"sockets": [listener]}, name="view-server")
-    thread.start()
-    try:
-        yield address_of(listener, "127.0.0.1")
-    finally:
-        server.should_exit = True
-        thread.join()
-        listener.close()
-        application.close()
