@@ -5,8 +5,9 @@ import torch
 from tests.baselines.conftest import config
 
 from derender.baselines import baseline_config, load_baseline, open_baseline, train_baseline
-from derender.baselines.e4e import E4e, E4eConfig, E4eSettings, EncoderSettings, open_generator
+from derender.baselines.e4e import E4e, E4eConfig, E4eSettings, EncoderSettings
 from derender.baselines.generator import GeneratorSettings
+from derender.baselines.stylegan2 import Stylegan
 from derender.training.run_folder import read_metrics
 
 TINY = GeneratorSettings(image_size=32, style_size=6, mapping_layers=2, channel_base=64, channel_max=6)
@@ -74,7 +75,7 @@ def test_runs_leave_models_that_embed(runs, blobs):
     model = load_baseline(runs / "e4e")
     assert isinstance(model, E4e) and model.embed(images)["w+"].shape == (5, 48)
     state = model.generator.state_dict()
-    generator = open_generator(runs / "stylegan2")
+    generator = Stylegan.open(runs / "stylegan2").generator
     assert all(torch.equal(value, state[key]) for key, value in generator.state_dict().items())
     assert model.seen == 48 and not torch.equal(model.centre, torch.zeros_like(model.centre))
     rows = read_metrics(runs / "e4e")
@@ -95,7 +96,7 @@ def test_smaller_images_are_enlarged_to_the_encoder_when_they_are_requested(runs
 
 def test_a_run_without_a_generator_is_refused_before_a_folder_is_made(runs, blobs, tmp_path):
     for more, told in (
-        ([], "name the generator to invert, as in --set generator=RUN"),
+        ([], "stylegan2 needs a model: a run of .* --model stylegan2, for e4e as --set generator=RUN"),
         ([f"generator={runs / 'e4e'}"], "holds the baseline 'e4e', asked for stylegan2"),
         ([f"generator={tmp_path / 'none'}"], "no baseline at"),
     ):

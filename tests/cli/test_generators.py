@@ -68,9 +68,9 @@ def test_a_generator_its_inversion_and_its_parts(faces, e4e, tmp_path, capsys):
 
 def test_what_is_missing_is_one_line(faces, e4e, tmp_path, refused):
     train = ("train", "-d", faces / "images", "--out", tmp_path / "run", "--model")
-    assert "name the generator to invert" in refused(*train, "e4e")
+    assert "for e4e as --set generator=RUN" in refused(*train, "e4e")
     assert "unknown setting 'generator'" in refused(*train, "ae", "--generator", e4e)
-    assert "name the encoder whose generator is catalogued" in refused(*train, "ris")
+    assert "for ris as --set e4e=RUN" in refused(*train, "ris")
     small = settings(f"e4e={e4e}")
     assert "set image_size=32" in refused(*train, "ris", *small)
     assert "holds no masks" in refused(*train, "ris", *small, "--set", "image_size=32")

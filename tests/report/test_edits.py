@@ -10,6 +10,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
 from derender.report.edits import Edit
+from derender.report.options import FilmOptions
 from derender.report.panel import row_sheets
 from derender.report.sweeps import animated_png, gif, mp4
 
@@ -59,7 +60,7 @@ def test_no_ffmpeg_is_an_error_that_helps(monkeypatch):
 def test_a_folder_has_strip_stills_film_and_numbers(tmp_path):
     images = frames(3, (20, 20))
     stills = dict(zip("ab", images[1:], strict=True))
-    edit = Edit({"input": images[0]}, stills, {"a": {"x": 1}, "b": {"x": 2}}, images, ("gif",), 0.3)
+    edit = Edit({"input": images[0]}, stills, {"a": {"x": 1}, "b": {"x": 2}}, images, FilmOptions(film="gif"))
     written = edit.write(tmp_path, {"picture": "one.png"})
     names = {"strip.png", "still-01.png", "still-02.png", "film.gif", "moved.json"}
     assert {file.name for file in tmp_path.iterdir()} == names

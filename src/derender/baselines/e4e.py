@@ -152,6 +152,7 @@ class E4e(LoopModel):
 
     name, settings_type, config_type = "e4e", E4eSettings, E4eConfig
     features = ("w+",)
+    given_as = ", for ris as --set e4e=RUN"
     not_judged = ("delta", "prior")
     settings: E4eSettings
     given_size: int | None = None
@@ -183,7 +184,7 @@ class E4e(LoopModel):
     @classmethod
     def build(cls, config: E4eConfig) -> "E4e":
         """The untrained encoder with the generator that the configuration names and its mean code."""
-        generator = open_generator(config.objective.generator)
+        generator = Stylegan.open(config.objective.generator).generator
         model = cls(E4eSettings(**config.model.model_dump(), generator=generator.settings))
         model.generator.load_state_dict(generator.state_dict())
         model.released.fill_(0)
@@ -243,13 +244,3 @@ class E4e(LoopModel):
             distance = mse_loss(run.aid(again), run.aid(images))
             terms["perceptual"] = objective.perceptual_weight * distance
         return terms
-
-
-def open_generator(source: str | Path | None) -> Generator:
-    """The averaged generator of a run."""
-    if source is None:
-        raise ValueError(
-            "name the generator to invert, as in --set generator=RUN (a run of derender train "
-            "--model stylegan2)"
-        )
-    return Stylegan.open(source).generator

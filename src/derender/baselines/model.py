@@ -54,13 +54,15 @@ class BaselineConfig(configs.LoopSettings):
 class BaselineModel(nn.Module, ABC):
     """A network that computes ``features`` of an image, of which ``embed`` returns the ``chosen``.
 
-    The first is the default. ``settings_type`` is of the network, ``config_type`` of a training run.
+    The first is the default. ``settings_type`` is of the network, ``config_type`` of a training run;
+    ``given_as`` says how another baseline is given it.
     """
 
     name: ClassVar[str]
     features: ClassVar[tuple[str, ...]]
     settings_type: ClassVar[type[BaselineSettings]]
     config_type: ClassVar[type[Settings]]
+    given_as: ClassVar[str] = ""
 
     def __init__(self, settings: BaselineSettings):
         super().__init__()
@@ -70,7 +72,8 @@ class BaselineModel(nn.Module, ABC):
     def open(cls, source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
         """A trained one; see `open_baseline`."""
         if source is None:
-            raise ValueError(f"the baseline {cls.name} needs a model: its run folder")
+            made = f"a run of derender train --model {cls.name}{cls.given_as}"
+            raise ValueError(f"the baseline {cls.name} needs a model: {made}")
         return load_baseline(source, cls.name)
 
     @property

@@ -126,11 +126,6 @@ class Ris(BaselineModel):
         resume: bool = False, accelerator: str = "cpu", **how: Any,
     ) -> TrainResult:  # fmt: skip
         """Build a catalogue into a new run folder; see `train_baseline`. No resume."""
-        if config.e4e is None and not resume:
-            raise ValueError(
-                "name the encoder whose generator is catalogued, as in --set e4e=RUN (a run of derender "
-                "train --model e4e)"
-            )
         e4e = E4e.open(config.e4e).to(accelerator)
         if e4e.image_size != config.image_size:
             raise ValueError(
@@ -152,8 +147,7 @@ def masked_rows(
     images: ImageSet, config: RisConfig
 ) -> tuple[Images, Float[Tensor, "n p h w"], tuple[str, ...]]:
     """The training part's images, a map of 0 and 1 for every part that occurs, and the parts' names."""
-    where: dict[str, Any] = {} if config.masks is None else {"masks": config.masks}
-    masked = read_masks(images.source, config.image_size, **where)
+    masked = read_masks(images.source, config.image_size, masks=config.masks)
     row_of = {file: row for row, file in enumerate(masked.images.files)}
     train = split_indices(images.files, config.split, seed=config.seed).train
     rows = np.array([row_of[images.files[index]] for index in train])

@@ -106,6 +106,7 @@ class Stylegan(LoopModel):
 
     name, settings_type, config_type = "stylegan2", gan.GeneratorSettings, StyleganConfig
     features = ("discriminator",)
+    given_as = ", for e4e as --set generator=RUN"
     not_judged = ("generator", "discriminator", "r1", "path")
     settings: gan.GeneratorSettings
     steps: Tensor

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 
 from derender import __version__
 from derender.data import as_float
+from derender.data.source import evenly_spaced
 from derender.demo.story import BUNDLED, STAGES, DemoResult
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import ScoreTable
@@ -32,18 +33,12 @@ from derender.training.run_folder import read_metrics
 
 CLUSTERS_SHOWN, MEMBERS_SHOWN, INPUTS_SHOWN, BUNDLED_SHOWN = 5, 12, 10, 4
 COLUMNS_BESIDE = ("reconstruction", "normals", "albedo", "another view")
-ENDED = {
-    "images": "the planned number of images",
-    "minutes": "the time limit",
-    "patience": "no more improvement on held-out images",
-    "collapse": "the watcher",
-}
 Pixels = UInt8[np.ndarray, "n 3 h w"]
 
 
 def demo_page(result: DemoResult) -> Page:
     """The whole report of one demo."""
-    rows = shown_rows(result)
+    rows = evenly_spaced(len(result.truth), result.settings.shown)  # chosen before anything was scored
     images, tables = result.truth.images[rows], score_tables(result)
     filmed = images[: result.settings.films]
     names = [f"unseen face {row + 1}" for row in range(len(images))]
@@ -51,20 +46,14 @@ def demo_page(result: DemoResult) -> Page:
     known = np.stack([one.picture for one in examples]).transpose(0, 3, 1, 2)
     faces = [f"rendered face {number + 1}" for number in range(len(known))]
     models = {"this run": result.model, BUNDLED: result.bundled}
+    step = max(1, len(result.seen) // INPUTS_SHOWN)
     same_size = result.model.image_size == result.bundled.image_size
     values = {
         "result": result,
         "usual": PRESETS[result.config.preset].images,
         "tables": tables,
-        "verdicts": {
-            "Depth": tables["geometry"].verdict(0),
-            "Normals": tables["geometry"].verdict(1),
-            "Identity": tables["clustering"].verdict(0),
-            "Reconstruction": tables["reconstruction"].verdict(0),
-        },
         "tile": _tile,
-        "inputs": colours.pictures(result.seen.images[:: max(1, len(result.seen) // INPUTS_SHOWN)]),
-        "inputs_shown": INPUTS_SHOWN,
+        "inputs": colours.pictures(result.seen.images[::step][:INPUTS_SHOWN]),
         "names": names,
         "meaning": COLUMN_MEANING,
         "decomposed": decompose_images(result.model, as_float(images)).columns,
@@ -81,7 +70,8 @@ def demo_page(result: DemoResult) -> Page:
         "people": len(np.unique(result.identities)),
         "clusters": _clusters(result),
         "charts": loss_charts(read_metrics(result.trained.folder)),
-        "training": _training(result),
+        "stages": STAGES,
+        "threads": torch.get_num_threads(),
         "presets": ", ".join(MODEL_PRESETS),
     }
     return Page(
@@ -108,12 +98,6 @@ def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
         "reconstruction": result.reconstruction.table(),
         "clustering": result.clustering,
     }
-
-
-def shown_rows(result: DemoResult) -> np.ndarray:
-    """Unseen images for the page, evenly through the set: chosen before anything was scored."""
-    count = min(result.settings.shown, len(result.truth))
-    return np.linspace(0, len(result.truth) - 1, count).round().astype(int)
 
 
 def _tile(table: ScoreTable, column: int, *controls: str) -> tuple[str, str]:
@@ -166,24 +150,10 @@ def _clusters(result: DemoResult) -> list[tuple[list[Any], str]]:
         groups.append((counts.max() / len(members), members))
     groups.sort(key=lambda group: (-group[0], -len(group[1])))
     shown = []
-    for pick in np.unique(np.linspace(0, len(groups) - 1, CLUSTERS_SHOWN).round().astype(int)):
+    for pick in evenly_spaced(len(groups), CLUSTERS_SHOWN):
         purity, members = groups[pick]
         faces = colours.pictures(result.truth.images[members[:MEMBERS_SHOWN]])
         names = result.identities[members[:MEMBERS_SHOWN]]
         row = [(face, f"a face of {name}", name) for face, name in zip(faces, names, strict=True)]
         shown.append((row, f"{len(members)} images, {100 * purity:.0f} % of one person"))
     return shown
-
-
-def _training(result: DemoResult) -> dict[str, object]:
-    trained = result.trained
-    return {
-        **{stage: f"{result.seconds[stage]:.0f} s" for stage in STAGES if stage in result.seconds},
-        "images seen": f"{trained.images:,}",
-        "images per second": f"{trained.images_per_second:.0f}",
-        "training ended by": ENDED.get(trained.stopped, trained.stopped),
-        "preset": result.config.preset,
-        "perceptual features": result.config.objective.perceptual,
-        "seed": result.seed,
-        "threads": torch.get_num_threads(),
-    }

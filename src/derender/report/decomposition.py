@@ -70,7 +70,15 @@ class Decomposition:
             if row.numbers
             for values in scene.parameters[row.parameter].tolist()
         }
-        written = {**record, **scene_numbers(scene), **named}
+        ambient, diffuse, pitch, yaw = scene.light[0].tolist()
+        *rotation, x, y, z = scene.camera[0].tolist()
+        angles = {"pitch_deg": degrees(pitch), "yaw_deg": degrees(yaw)}
+        written = {
+            **record,
+            "light": {"ambient": ambient, "diffuse": diffuse, **angles},
+            "camera": {"rotation_deg": [*map(degrees, rotation)], "translation": [x, y, z]},
+            **named,
+        }
         labelled_grid({name: [image] for name, image in self.row.items()}).save(folder / "panel.png")
         for name, image in self.row.items():
             image.convert("RGBA").save(folder / f"{name.replace(' ', '_')}.png")
@@ -136,17 +144,6 @@ def decomposed(model: Derenderer, image: OpenedImage) -> Decomposition:
         albedo = detail.on_grid(detail.albedo(), detail.size)
         scene = at_size(scene, detail.size).with_parameters(albedo=albedo)
     return decomposition(model, as_float(image.pixels[None]), scene, image.depth_range)
-
-
-def scene_numbers(scene: Scene) -> dict[str, Any]:
-    """Light and camera of one scene, angles in degrees."""
-    ambient, diffuse, pitch, yaw = scene.light[0].tolist()
-    *rotation, x, y, z = scene.camera[0].tolist()
-    strengths = {"ambient": ambient, "diffuse": diffuse}
-    return {
-        "light": {**strengths, "pitch_deg": degrees(pitch), "yaw_deg": degrees(yaw)},
-        "camera": {"rotation_deg": [degrees(angle) for angle in rotation], "translation": [x, y, z]},
-    }
 
 
 def under_another_light(scene: Scene) -> Scene:

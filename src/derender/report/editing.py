@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image
 
 from derender.photo import edit_video, is_video
@@ -140,13 +139,16 @@ def write_images(
     needed = not moving and not done
     read, refused = readable(images_only, opener.read, progress, needed)
     doubts = {} if force else opener.unsuitable(read)
-    help = _help(np.stack([read.pop(path)[0] for path in doubts])) if doubts else ""
+    help = ""
+    if doubts:
+        better = fitting_better(np.stack([read.pop(path)[0] for path in doubts]), TEMPLATES)
+        help = f"{better}{better and '; '}--frame auto looks for another part, --force draws all"
     refused |= {str(path): doubt for path, doubt in doubts.items()}
     if doubts and needed and not read:
         path, doubt = next(iter(doubts.items()))
         raise ValueError(f"{path}: {doubt}; {help}")
-    shown = {file: kept / f"{places[file].name}.npz" for file in places if file in done or file in read}
-    shown = {file: row for file, row in shown.items() if not is_video(file)}
+    with_row = [file for file in places if file in read or (file in done and not is_video(file))]
+    shown = {file: kept / f"{places[file].name}.npz" for file in with_row}
     with_sheet = len(shown) > 1 if sheet is None else sheet
     with_sheet &= all(row.exists() for file, row in shown.items() if file in done)
     records: list[dict[str, Any]] = []
@@ -239,12 +241,6 @@ def _copy_single(folder: Path, temporary: Path, out: Path) -> None:
             (still.convert("RGB") if kind == "JPEG" else still).save(temporary, format=kind, quality=95)
     else:
         shutil.copyfile(files[0], temporary)
-
-
-def _help(pixels: UInt8[np.ndarray, "n 3 s s"]) -> str:
-    """What to do with images that do not suit a model of faces."""
-    how = "--frame auto looks for another part, --force draws all"
-    return "; ".join(filter(None, (fitting_better(pixels, TEMPLATES), how)))
 
 
 @contextmanager

@@ -44,8 +44,7 @@ class Edit:
     stills: Mapping[str, Image.Image]  # what came out, by label
     numbers: Mapping[str, Any]  # what holds in each still, by the same labels: anything JSON can hold
     frames: Images = field(default_factory=list)  # of a film; empty for none
-    films: Sequence[str] = ()  # kinds of film that are written
-    seconds: float = 2.4  # length of the film
+    film: FilmOptions = field(default_factory=FilmOptions)  # its kinds, and how long it takes
 
     @property
     def row(self) -> dict[str, Image.Image]:
@@ -58,8 +57,8 @@ class Edit:
         strip = labelled_grid({name: [one] for name, one in self.row.items()}, layout=GridLayout(cell))
         stills = []
         with ThreadPoolExecutor() as pool:  # films are encoded while stills are
-            kinds = self.films if self.frames else ()
-            films = {kind: pool.submit(FILMS[kind], self.frames, self.seconds) for kind in kinds}
+            kinds = self.film.kinds if self.frames else ()
+            films = {kind: pool.submit(FILMS[kind], self.frames, self.film.seconds) for kind in kinds}
             strip.save(folder / "strip.png", compress_level=1)
             for number, (label, still) in enumerate(self.stills.items(), 1):
                 name = f"still-{number:02d}.png"
@@ -209,8 +208,7 @@ def _swept(
         dict(zip(labels, drawn(rows, image.render), strict=True)),
         {text: {parameter: row} for text, row in zip(labels, rows.tolist(), strict=True)},
         moving,
-        film.kinds,
-        film.seconds,
+        film,
     )
 
 

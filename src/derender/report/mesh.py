@@ -76,8 +76,6 @@ class Mesh:
         """
         require_known("format", form, MESH_FORMATS)
         import trimesh
-        from trimesh.exchange.gltf import export_glb
-        from trimesh.exchange.obj import export_obj
         from trimesh.visual import TextureVisuals
         from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
@@ -87,19 +85,18 @@ class Mesh:
                 self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False
             )
 
+        how: dict[str, Any] = {"include_normals": True}
         if form == "glb":
             material = PBRMaterial(
                 name="albedo", baseColorTexture=self.texture, metallicFactor=0.0, roughnessFactor=1.0,
                 doubleSided=True,
             )  # fmt: skip
-            scene = trimesh.Scene(shape(material))
-            return {f"{name}.glb": bytes(export_glb(scene, include_normals=True))}
+            return {f"{name}.glb": shape(material).export(file_type="glb", **how)}
         name = re.sub(r"[^\w.-]", "_", name)
         matt = SimpleMaterial(image=self.texture, diffuse=[255] * 4, ambient=[0] * 4, specular=[0] * 4)
         matt.name = name
-        text, beside = export_obj(
-            shape(matt), include_normals=True, return_texture=True, mtl_name=f"{name}.mtl"
-        )
+        how |= {"return_texture": True, "mtl_name": f"{name}.mtl"}
+        text, beside = shape(matt).export(file_type="obj", **how)
         more = {file: beside[file] for file in (f"{name}.mtl", f"{name}.png")}
         return {f"{name}.obj": text.encode(), **more}
 

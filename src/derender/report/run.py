@@ -4,26 +4,25 @@ With ``evidence`` (data, decompositions, films, scores, card, explanation) the p
 """
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from math import isfinite
-from operator import getitem
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from derender.baselines import read_any_config
 from derender.data import read_photo
+from derender.data.source import evenly_spaced
 from derender.model import Derenderer
+from derender.overrides import settings_by_name
 from derender.report import charts, colours
 from derender.report.decomposition import decompose_images
 from derender.report.evidence import Evidence, recorded_environment
 from derender.report.page import Page, image_bytes
 from derender.report.panel import labelled_grid
-from derender.training.config import TrainConfig, setting_names
+from derender.training.config import TrainConfig
 from derender.training.run_folder import RunFolder, read_metrics
 
 SHEETS_SHOWN, SHEET_PX, SHEET_PIXEL_LIMIT = 4, 1080, 20_000_000
@@ -52,8 +51,7 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
     samples, unread = _samples(run)
     config = read_any_config(run.path)
     metrics, environment = read_metrics(run.path), recorded_environment(run.path)
-    tree = config.model_dump(mode="json")
-    settings = {name: reduce(getitem, name.split("."), tree) for name in setting_names(type(config))}
+    settings = settings_by_name(config.model_dump(mode="json"))
     values = {
         "facts": _facts(metrics, config),
         "watcher": [
@@ -65,7 +63,13 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
         "charts": loss_charts(metrics),
         "samples": samples,
         "evidence": evidence,
-        "failures": [*_failures(run, config, metrics), *unread],
+        "seen": metrics[-1]["images"] if metrics else 0,
+        "planned": getattr(config, "images", 0),
+        "saved": run.model.exists(),
+        "not_finite": sum(
+            any(isinstance(v, float) and not isfinite(v) for v in row.values()) for row in metrics
+        ),
+        "unread": unread,
         "settings": settings,
         "environment": environment,
     }
@@ -107,26 +111,12 @@ def _facts(metrics: Metrics, config: Any) -> dict[str, str]:
     return facts
 
 
-def _failures(run: RunFolder, config: Any, metrics: Metrics) -> list[str]:
-    """Sentences on everything that was cut short or is no number."""
-    lines = []
-    seen, planned = (metrics[-1]["images"] if metrics else 0), getattr(config, "images", 0)
-    if seen < planned:
-        why = "the run was stopped (time limit, patience, watcher or Ctrl-C), or is running."
-        lines.append(f"{seen:,} of {planned:,} planned images were seen: {why}")
-    if not run.model.exists():
-        lines.append("There is no saved model: no validation was reached.")
-    rows = sum(1 for row in metrics if any(isinstance(v, float) and not isfinite(v) for v in row.values()))
-    return [*lines, f"{rows:,} logged rows hold NaN or infinity."] if rows else lines
-
-
 def _samples(run: RunFolder) -> tuple[list[tuple[bytes, str]], list[str]]:
     """Sheets as JPEG at most ``SHEET_PX`` wide, first, last and evenly between, with the images seen; why
     others cannot be drawn.
     """
     sheets, made, unread = sorted(run.samples.glob("*.png")), [], []
-    shown = min(SHEETS_SHOWN, len(sheets))
-    for place in np.linspace(0, len(sheets) - 1, shown).round().astype(int):
+    for place in evenly_spaced(len(sheets), SHEETS_SHOWN):
         name = sheets[place].stem
         try:
             small = Image.fromarray(read_photo(sheets[place], SHEET_PIXEL_LIMIT))
