@@ -17,23 +17,15 @@ import typer
 
 from derender.cli.console import notice, progress_bar, report_images, result, write_json
 from derender.report.options import ImageOptions, option, single_suffix
-from derender.storage.places import (
-    DEVICES,
-    bundled_models,
-    counted,
-    hub_id,
-    model_folder,
-    require_image,
-    require_images,
-    require_known,
-)
+from derender.storage import places
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
     from derender.report.opening import ImageOpener, OpenedImage
 
-MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {', '.join(bundled_models())}."
+BUNDLED = ", ".join(places.bundled_models())
+MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {BUNDLED}."
 IMAGES = "Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it."
 DATASET = "Layout of the images, if it is not recognised."
 JSON = "Also write the numbers as JSON; - is standard output."
@@ -181,7 +173,7 @@ class PartOfImages(DataOptions):
 
     def __post_init__(self) -> None:
         if (address := self.optional_address) is not None and self.dataset == "auto":
-            require_images(address)
+            places.require_images(address)
 
     @property
     def how(self) -> dict[str, Any]:
@@ -196,9 +188,9 @@ class TrainedModel:
     device: Device = "auto"
 
     def __post_init__(self) -> None:
-        require_known("device", self.device, DEVICES)
-        if not hub_id(self.model):
-            model_folder(self.model)
+        places.require_known("device", self.device, places.DEVICES)
+        if not places.hub_id(self.model):
+            places.model_folder(self.model)
 
     def open(self, fit_steps: int | None = None) -> "Derenderer":
         """Load it."""
@@ -241,7 +233,7 @@ class ImageFiles:
     resume: bool = option(False, "Leave out images that are done.", "--resume")
 
     def __post_init__(self) -> None:
-        require_image(self.images)
+        places.require_image(self.images)
 
     @property
     def suffix(self) -> str:
@@ -268,7 +260,7 @@ class ImageFiles:
                 ) from None
         for note in written.notes():
             notice(note)
-        output.result(f"{counted(len(written.images), 'images')} in {self.out}")
+        output.result(f"{places.counted(len(written.images), 'images')} in {self.out}")
         output.write(written.values())
         if set(written.refused) & {str(path) for path in self.images}:  # of a folder others were used
             raise typer.Exit(2)

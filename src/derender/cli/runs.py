@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from derender.cli.console import (
-    duration,
-    is_main_process,
-    notice,
-    progress_bar,
-    report_images,
-    result,
-    write_json,
-)
+from derender.cli import console
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
@@ -38,8 +30,8 @@ def dry_run_shown(config: Any, json_file: str | None) -> None:
     """Show all settings of a run."""
     from derender.training.config import to_yaml
 
-    result(to_yaml(config).rstrip(), json_file)
-    write_json(json_file, config.model_dump(mode="json"))
+    console.result(to_yaml(config).rstrip(), json_file)
+    console.write_json(json_file, config.model_dump(mode="json"))
 
 
 @contextmanager
@@ -55,26 +47,26 @@ def run_progress() -> Iterator[dict[str, Any]]:
     from derender.data.doctor import quick_verdict
 
     def note(images: "ImageSet") -> None:
-        report_images(images)
+        console.report_images(images)
         if images.terms:
-            notice(f"on its owners' terms: {images.terms}")
-        if is_main_process() and (doubts := quick_verdict(images)):
-            notice(f"the doctor: {doubts} (derender doctor has more)")
+            console.notice(f"on its owners' terms: {images.terms}")
+        if console.is_main_process() and (doubts := quick_verdict(images)):
+            console.notice(f"the doctor: {doubts} (derender doctor has more)")
 
-    with progress_bar("reading") as report:
+    with console.progress_bar("reading") as report:
         yield {"on_images": note, "progress": show}
 
 
 def report_run(run: "TrainResult") -> None:
     """Note how a run ended."""
     for finding in run.findings:
-        notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+        console.notice(f"{finding.sign}: {finding.text}; {finding.advice}")
     if run.stopped == "collapse":
-        notice("training on is pointless: the last good checkpoint and model are kept, if any")
-    waited = f"{run.waiting:.1%} of it waiting for data"
-    notice(f"{run.images:,} images in {duration(run.seconds)}, {waited}; stopped by: {run.stopped}")
+        console.notice("training on is pointless: the last good checkpoint and model are kept, if any")
+    took = f"{console.duration(run.seconds)}, {run.waiting:.1%} of it waiting for data"
+    console.notice(f"{run.images:,} images in {took}; stopped by: {run.stopped}")
     if run.stopped != "collapse" and run.model_images not in (None, run.images):
-        notice(
+        console.notice(
             f"the model has the weights of {run.model_images:,} images, the best on held-out ones; "
             "for those of the end: the same command with --resume --set keep=last"
         )
