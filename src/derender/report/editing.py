@@ -107,8 +107,8 @@ def write_images(
         opener: a model and how images are read and drawn.
         paths: image files, videos, and folders of them.
         out: folder of the folders.
-        edit: makes of an opened image what is written: its ``row`` has the cells of a sheet over all images,
-            ``write`` takes its folder and its record, and returns the record with what was written.
+        edit: makes of an opened image what is written. Its ``row`` has the cells of a sheet over all images.
+            Its ``write`` takes a folder and a record, and returns the record with what was written.
         force: replace what is there, and draw images that do not suit the model.
         sheet: also draw a row for every image as sheet.png; by default for two images or more. With
             ``resume`` it shows those of the interrupted run, too; none is drawn where a row is missing.

@@ -84,7 +84,7 @@ def _require_small(text: str) -> None:
             around, before, deepest = within.pop()
             within.append((around, before + values, max(deepest, levels)))
         if within[-1][1] > MOST_VALUES or len(within) + within[-1][2] > DEEPEST + 1:
-            raise ValueError(f"more than {MOST_VALUES:,} values or {DEEPEST} levels")
+            raise ValueError(f"more than {DEEPEST} levels or {MOST_VALUES:,} values")
 
 
 def parse_yaml(text: str) -> Any:
