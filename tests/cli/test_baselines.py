@@ -119,7 +119,7 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     train = ("train", "--data", faces, "--out", tmp_path / "run")
     assert "did you mean 'simclr'" in refused(*train, "--model", "simcrl")
     assert "preset is for derender models" in refused(*train, "--model", "ae", "--preset", "small")
-    assert "'model.codes'" in refused(*train, "--model", "vqvae", "--set", "code=3")
+    assert "'model.codes'" in refused(*train, "--model", "vqvae", "--set", "codess=3")
     other = refused("train", "--model", "ae", "--data", faces, "--out", run, "--resume")
     assert f"{run} trained vqvae, not ae" in other
     assert not out.exists() and not (tmp_path / "run").exists()
