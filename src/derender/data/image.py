@@ -25,6 +25,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -59,10 +60,10 @@ _UPRIGHT = (  # by orientation, from 2 on
     *(Transpose.ROTATE_270, Transpose.TRANSVERSE, Transpose.ROTATE_90),
 )
 
-# What Pillow and the libraries under it raise on damaged or hostile files (found by feeding them such files).
+# What readers of images and archives raise on damaged or hostile files (found by feeding them such files).
 DECODER_ERRORS = (
     *(OSError, ValueError, SyntaxError, EOFError, LookupError, TypeError, AttributeError, ArithmeticError),
-    *(MemoryError, RuntimeError, struct.error, zlib.error, Image.DecompressionBombError),
+    *(MemoryError, RuntimeError, struct.error, zlib.error, BadZipFile, Image.DecompressionBombError),
 )
 
 

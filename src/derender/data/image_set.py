@@ -28,7 +28,7 @@ from derender.data.image import FITS, READER_VERSION, Unreadable, quiet_pillow
 from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
 from derender.data.source import Skipped
-from derender.data.stream import Decoded, Kinds, Progress, Stream, Value, column_of, decoded, estimated_total
+from derender.data.stream import Decoded, Kinds, Progress, Stream, column_of, decoded, estimated_total
 from derender.storage.places import counted, require_known, suggestion
 
 
@@ -219,7 +219,7 @@ def read_images(
                 if progress is not None:
                     done = chunk[-1].number + 1
                     progress(done, estimated_total(done, chunk[-1].share, stream.limit))
-            if not result.files:
+            if not result.rows:
                 where, skipped = f"{stream.source} ({stream.layout})", result.skipped
                 first = f"the first is {skipped[0].file!r}: {skipped[0].reason}" if skipped else ""
                 none = f"none of the {len(skipped):,} images in {where} can be read; {first}"
@@ -230,7 +230,7 @@ def read_images(
             images = np.empty((count, 3, image_size, image_size), np.uint8)
             for row, pixels in enumerate(chain.from_iterable(kept())):
                 images[row] = pixels
-            return _joined(stream, images[: len(result.files)], result.content())
+            return _joined(stream, images[: len(result.rows)], result.content())
         settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
         made_of = repr((settings, PIL.__version__, stream.identity()))
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
@@ -255,15 +255,12 @@ def as_float(images: UInt8[np.ndarray, "*n 3 h w"] | UInt8[Tensor, "*n 3 h w"]) 
 
 @dataclass
 class _Found:
-    """What is known after each image: names, labels and partitions of the rows, and what is left out."""
+    """What is known after each image: the rows, without their pixels, and what is left out."""
 
     keep_duplicates: bool
-    files: list[str] = field(default_factory=list)
+    rows: list[Decoded] = field(default_factory=list)
     skipped: list[Skipped] = field(default_factory=list)
     copies: list[Duplicate] = field(default_factory=list)
-    columns: dict[str, list[Value]] = field(default_factory=dict)
-    partitions: list[str] = field(default_factory=list)
-    kinds: Kinds = field(default_factory=Kinds)
     seen: dict[bytes, str] = field(default_factory=dict)  # the first file of each digest
 
     def add(self, one: Decoded) -> bool:
@@ -276,23 +273,20 @@ class _Found:
             if not self.keep_duplicates:
                 return False
         self.seen.setdefault(one.outcome, one.file)
-        self.kinds.see(one.labels)
-        for name in one.labels:
-            self.columns.setdefault(name, [None] * len(self.files))
-        for name, column in self.columns.items():
-            column.append(one.labels.get(name))
-        self.files.append(one.file)
-        self.partitions.append(one.partition)
+        self.rows.append(one._replace(pixels=None))
         return True
 
     def content(self) -> dict[str, Any]:
         """Everything, as JSON has it."""
+        kinds, partition = Kinds(), [one.partition for one in self.rows]
+        for one in self.rows:
+            kinds.see(one.labels)
         return {
-            "files": self.files,
+            "files": [one.file for one in self.rows],
             "skipped": list(map(asdict, self.skipped)),
             "duplicates": list(map(asdict, self.copies)),
-            "labels": {name: [self.kinds[name], column] for name, column in self.columns.items()},
-            "partition": self.partitions if any(self.partitions) else None,
+            "labels": {name: [kinds[name], [one.labels.get(name) for one in self.rows]] for name in kinds},
+            "partition": partition if any(partition) else None,
         }
 
 

@@ -14,9 +14,7 @@ unpack to endless ones.
 import hashlib
 import os
 import re
-import struct
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -27,7 +25,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 from jaxtyping import Int64
 
-from derender.data.image import HEAD_BYTES, LARGE_BYTES, Unreadable, refuse_by_header
+from derender.data.image import DECODER_ERRORS, HEAD_BYTES, LARGE_BYTES, Unreadable, refuse_by_header
 from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
@@ -51,12 +49,6 @@ _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
 _UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
 
-# What unpacking raises on damaged members (found by feeding it such).
-_UNPACKING_ERRORS = (
-    *(OSError, ValueError, LookupError, EOFError, RuntimeError, MemoryError, OverflowError),
-    *(struct.error, zlib.error, zipfile.BadZipFile),
-)
-
 
 class ZipSource(Source):
     """The members of a zip that are neither hidden, unsafe, encrypted nor packed in a way of their own.
@@ -68,7 +60,7 @@ class ZipSource(Source):
         self.path = path
         try:
             self._archive = zipfile.ZipFile(path)
-        except _UNPACKING_ERRORS as problem:
+        except DECODER_ERRORS as problem:
             raise ValueError(
                 f"{path} is damaged or not a whole zip file ({problem}); download or copy it again"
             ) from problem
@@ -109,7 +101,7 @@ class ZipSource(Source):
                 raise ValueError("it is shorter than the directory says")
         except Unreadable:
             raise
-        except _UNPACKING_ERRORS as problem:
+        except DECODER_ERRORS as problem:
             raise ValueError(f"cannot be unpacked: {problem}") from problem
         return content
 

@@ -123,36 +123,30 @@ class FolderSource(FileSource):
         self._found: dict[str, str] = {}  # each file's path by its printable path
         faults: dict[str, str] = {}  # what is no file, and why
         seen: set[tuple[int, int]] = set()
-        waiting = [""]
-        while waiting:
-            here, below = waiting.pop(), []
-            try:
-                status = os.stat(f"{path}/{here}")  # noqa: PTH116  (a million times)
-                if (status.st_dev, status.st_ino) in seen:
-                    continue
-                seen.add((status.st_dev, status.st_ino))
-                with os.scandir(f"{path}/{here}") as listed:
-                    entries = [entry for entry in listed if not is_hidden(entry.name)]
-            except OSError as problem:
-                faults[here.rstrip("/") or "."] = f"folder cannot be listed: {problem.strerror}"
-                continue
-            if here and {"config.yaml", "environment.json"}.issubset(entry.name for entry in entries):
-                faults[here.rstrip("/")] = "a run folder: its sheets are no images to read"
-                continue
+
+        def unlisted(problem: OSError) -> None:
+            here = Path(problem.filename).relative_to(path).as_posix()
+            faults[here] = f"folder cannot be listed: {problem.strerror}"
+
+        for folder, below, names in os.walk(path, onerror=unlisted, followlinks=True):
+            here, status = Path(folder).relative_to(path).as_posix(), Path(folder).stat()
+            entries = [name for name in names if not is_hidden(name)]
+            if here != "." and {"config.yaml", "environment.json"}.issubset(entries):
+                faults[here] = "a run folder: its sheets are no images to read"
+                entries, below[:] = [], []
+            elif (status.st_dev, status.st_ino) in seen:
+                entries, below[:] = [], []
+            seen.add((status.st_dev, status.st_ino))
+            below[:] = sorted(name for name in below if not is_hidden(name))
             for entry in entries:
-                name = f"{here}{entry.name}"
+                name = entry if here == "." else f"{here}/{entry}"
                 try:
-                    mode = entry.stat().st_mode
+                    if stat.S_ISREG(os.stat(f"{path}/{name}").st_mode):  # noqa: PTH116  (a million times)
+                        self._found[printable(name)] = name
+                    else:
+                        faults[name] = "not a regular file"
                 except OSError as problem:
                     faults[name] = f"broken link or unreachable file: {problem.strerror}"
-                    continue
-                if stat.S_ISREG(mode):
-                    self._found[printable(name)] = name
-                elif stat.S_ISDIR(mode):
-                    below.append(f"{name}/")
-                else:
-                    faults[name] = "not a regular file"
-            waiting += sorted(below, reverse=True)
         self.files = tuple(sorted(self._found))
         self.skipped = tuple(Skipped(printable(name), faults[name]) for name in sorted(faults))
 
@@ -183,11 +177,7 @@ def is_hidden(name: str) -> bool:
 
 def printable(name: str) -> str:
     """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    return name
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from derender.data.layouts.layout import PARTITION_NAMES
 from derender.data.source import FILE_LIMIT_BYTES, is_hidden, is_image, printable, stamps_of
 from derender.data.stream import Sample, Stream, Value, label_name, unreadable
 from derender.storage.bounded import read_bounded
-from derender.storage.places import suggestion
+from derender.storage.places import optional, suggestion
 
 SHARD_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 """File names that end in one of these are taken for shards."""
@@ -227,13 +227,7 @@ class HuggingFaceStream(Stream):
         self, source: str, place: str | Path, *, split: str | None = None, column: str | None = None,
         config: str | None = None, revision: str | None = None,
     ):  # fmt: skip
-        try:
-            import datasets
-        except ImportError as problem:
-            raise ValueError(
-                f"reading {source} as a Hugging Face data set needs the package datasets: "
-                "pip install 'derender[huggingface]'"
-            ) from problem
+        datasets = optional("datasets", f"reading {source} as a Hugging Face data set", "huggingface")
         self.source = source
         self._where = place
         self._options = (split, column, config)

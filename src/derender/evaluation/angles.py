@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from posixpath import basename
 from typing import Any
 from zipfile import BadZipFile
 
@@ -19,7 +20,6 @@ from torch import Tensor
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet
 from derender.data.layouts import rendered
-from derender.data.layouts.layout import base_name
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
 from derender.evaluation.image_scores import binned_rows
 from derender.evaluation.options import Options
@@ -158,8 +158,8 @@ def known_angles(
     """(N, angles) in degrees by the names of ``labels``, and the images that have them all."""
     if table is not None:
         columns = read_columns(table, tuple(labels))
-        place = {base_name(name): row for row, name in enumerate(columns["name"].tolist())}
-        rows = np.array([place.get(base_name(file), -1) for file in images.files])
+        place = {basename(name): row for row, name in enumerate(columns["name"].tolist())}
+        rows = np.array([place.get(basename(file), -1) for file in images.files])
         if not (rows >= 0).any():
             raise ValueError(f"{table} names none of the images (its first is {columns['name'][0]})")
         true = np.stack([columns[name].astype(np.float64)[rows] for name in labels], axis=1)

@@ -134,15 +134,11 @@ def read_plan(path: str | Path) -> Plan:
         raise FileNotFoundError(f"no plan at {path}: give --plan the name of a YAML or TOML file")
     try:
         text = read_text(path, YAML_LIMIT)
-        tree = tomllib.loads(text) if path.suffix == ".toml" else parse_yaml(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} cannot be read as a plan: {error}") from error
-    try:
-        plan = checked(tree, Plan)
+        plan = checked(tomllib.loads(text) if path.suffix == ".toml" else parse_yaml(text), Plan)
         for fault in _faults(plan):
             raise ValueError(fault)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read as a plan: {error}") from error
     return plan
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from derender.data import suggestion
 from derender.render import Rendering
-from derender.renderers.renderer import FunctionRenderer, Renderer
+from derender.renderers.renderer import Renderer
 from derender.scene import Scene
 from derender.storage.bounded import parse_yaml
 from derender.storage.places import bundled_renderers
@@ -58,7 +58,7 @@ def as_renderer(given: str | Render | None, stored: str) -> Renderer:
     """A renderer by name or itself, by default the ``stored`` one; a function is called as it is."""
     if given is None or isinstance(given, str):
         return renderer_named(given or stored)
-    return given if isinstance(given, Renderer) else FunctionRenderer(stored, function=given)
+    return given if isinstance(given, Renderer) else Renderer(stored, function=given)
 
 
 def recorded_renderer(stored: str, given: str | Render | None, source: str | Path) -> Renderer:

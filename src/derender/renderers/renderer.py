@@ -39,6 +39,7 @@ class Renderer:
         gamma: of the images; light is added in values to this power.
         maps: further columns of a panel, (scene, fov_deg) to (N, H, W) or (N, 3, H, W) in 0..1 by title.
         penalty: (scene, shading) to a scalar that training adds to its loss.
+        function: (scene, fov_deg) to the rendering, in place of all stages; shading stays Lambert's.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Renderer:
     gamma: float = 1.0
     maps: Mapping[str, Callable[[Scene, float], Tensor]] = field(default_factory=dict)
     penalty: Callable[[Scene, Tensor], Tensor] | None = None
+    function: Callable[[Scene, float], Rendering] | None = None
 
     @property
     def all_factors(self) -> tuple[Factor, ...]:
@@ -59,6 +61,8 @@ class Renderer:
 
     def __call__(self, scene: Scene, fov_deg: float, backend: str = "auto") -> Rendering:
         """Images of scenes; a number out of its range, or NaN made of finite scenes, is a ValueError."""
+        if self.function is not None:
+            return self.function(scene, fov_deg)
         self.check(scene)
         image = self.shade(scene, fov_deg, backend)
         rendering = warp(image, scene.depth, scene.camera, fov_deg, backend)
@@ -153,17 +157,6 @@ class Renderer:
         gamma = max(self.gamma, other.gamma)
         maps, factors = {**self.maps, **other.maps}, (*self.factors, *other.factors)
         return replace(self, name=name, factors=factors, gamma=gamma, maps=maps, **own)
-
-
-@dataclass(frozen=True)
-class FunctionRenderer(Renderer):
-    """Draws scenes by any function of scenes and field of view; shading is Lambert's."""
-
-    function: Callable[[Scene, float], Rendering] | None = None
-
-    def __call__(self, scene: Scene, fov_deg: float, backend: str = "auto") -> Rendering:
-        assert self.function is not None
-        return self.function(scene, fov_deg)
 
 
 def _finite(value: Tensor) -> bool:

@@ -1,12 +1,10 @@
 """How data sets lie: the list of layouts, most particular first, a row each; and anybody's own folders.
 
 A table that somebody laid beside images comes first: it says what they are. Of folders, one named train, val
-or test (and the like) is read as a partition, not as a class. What a folder means is worked out once for all
-of its images, of which there may be millions.
+or test (and the like) is read as a partition, not as a class.
 """
 
-from collections.abc import Callable
-from functools import cache
+from posixpath import basename
 
 from derender.data.layouts import faces, rendered, tables
 from derender.data.layouts.layout import (
@@ -14,7 +12,6 @@ from derender.data.layouts.layout import (
     TOLD,
     Layout,
     Table,
-    base_name,
     mostly,
     parent_name,
     partition_by_folder,
@@ -31,12 +28,6 @@ def _class(file: str) -> str:
     return "" if name.lower() in PARTITION_NAMES else name
 
 
-def _by_folder(files: tuple[str, ...], meaning: Callable[[str], str]) -> list[str]:
-    """The meaning of the folder of each file."""
-    known = cache(lambda folder: meaning(f"{folder}/"))
-    return [known(file.rpartition("/")[0]) for file in files]
-
-
 def _is_classes(source: Source) -> bool:
     """Every image lies in a class folder, all at one depth, and there are two classes or more."""
     folders = {file.rpartition("/")[0] for file in source.images}
@@ -45,11 +36,11 @@ def _is_classes(source: Source) -> bool:
 
 
 def _load_folder(source: Source) -> Table:
-    return Table(source.images, partition=partition_column(_by_folder(source.images, partition_by_folder)))
+    return Table(source.images, partition=partition_column(map(partition_by_folder, source.images)))
 
 
 def _load_classes(source: Source) -> Table:
-    labels = {"class": text_column(_by_folder(source.images, _class))}
+    labels = {"class": text_column(map(_class, source.images))}
     return Table(source.images, labels, _load_folder(source).partition)
 
 
@@ -62,8 +53,8 @@ _READERS = {  # by name: whether a source looks like the layout, and the table o
     "rafdb": (lambda source: faces.raf_list(source) is not None, faces.load_rafdb),
     "celebamask": (faces.is_celebamask, faces.load_celebamask),
     "celeba": (faces.is_celeba, faces.load_celeba),
-    "utkface": (lambda source: mostly(faces.UTK_NAME, map(base_name, source.images)), faces.load_utkface),
-    "yaleb": (lambda source: mostly(faces.YALE_NAME, map(base_name, source.images)), faces.load_yale),
+    "utkface": (lambda source: mostly(faces.UTK_NAME, map(basename, source.images)), faces.load_utkface),
+    "yaleb": (lambda source: mostly(faces.YALE_NAME, map(basename, source.images)), faces.load_yale),
     "lfw": (lambda source: mostly(faces.LFW_NAME, source.images), faces.load_lfw),
     "shapenet_cars": (rendered.is_cars, rendered.load_cars),
     "face_tracks": (faces.is_tracks, faces.load_tracks),

@@ -15,6 +15,7 @@ zero with CelebA's numbers, which start at one. Here an image is in the part in 
 
 import re
 from collections.abc import Mapping, Sequence
+from posixpath import basename
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,6 @@ from derender.data.layouts.layout import (
     TOLD,
     Labels,
     Table,
-    base_name,
     header_of,
     number_column,
     parent_name,
@@ -60,7 +60,7 @@ _NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
 def load_utkface(source: Source) -> Table | None:
     """Age, gender and race from the names; values outside the published codes count as unknown."""
-    results = [UTK_NAME.match(base_name(file)) for file in source.images]
+    results = [UTK_NAME.match(basename(file)) for file in source.images]
     if source.images and not any(results):
         return None
     ages = [float(one["age"]) if one else np.nan for one in results]
@@ -73,7 +73,7 @@ def load_utkface(source: Source) -> Table | None:
 
 def load_yale(source: Source) -> Table:
     """Person, pose and light from the names; ``light_deg`` is the angle between light and view."""
-    result = {file: match for file in source.images if (match := YALE_NAME.fullmatch(base_name(file)))}
+    result = {file: match for file in source.images if (match := YALE_NAME.fullmatch(basename(file)))}
     azimuth, elevation = (np.array([float(one[name]) for one in result.values()]) for name in ("a", "e"))
     cosine = np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))
     labels = {name: text_column(one[name] for one in result.values()) for name in ("identity", "pose")}
@@ -100,7 +100,7 @@ def load_lfw(source: Source) -> Table | None:
     labels = {"identity": text_column(people)}
     if (emotions := source.named("emotions.csv")) is not None:
         by_name = {row["file"]: row["emotion"] for row in read_csv(source, emotions, ("file", "emotion"))}
-        labels["emotion"] = text_column(by_name.get(base_name(file), "") for file in files)
+        labels["emotion"] = text_column(by_name.get(basename(file), "") for file in files)
     partition = text_column(part_of_person.get(person, "") for person in people) if part_of_person else None
     return Table(files, labels, partition)
 
@@ -274,7 +274,7 @@ def load_celeba(source: Source) -> Table | None:
         for folder in ("img_align_celeba", "img_celeba")
     )
     files = aligned or wild or source.images
-    names = [base_name(file) for file in files]
+    names = [basename(file) for file in files]
     labels, partition = _attributes(source, "list_attr_celeba", names), None
     if (listed := _owners_list(source, "identity_CelebA")) is not None:
         labels["identity"] = text_column(listed.rows.get(name, [""])[0] for name in names)
@@ -312,7 +312,7 @@ def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.nd
     listed = _OwnersList(
         f"{file} in {source.path}",
         columns,
-        {base_name(row["file"]): [row[c] for c in columns] for row in rows},
+        {basename(row["file"]): [row[c] for c in columns] for row in rows},
     )
     if missing := [name for name in names if name not in listed.rows]:
         raise ValueError(
@@ -348,7 +348,7 @@ def _mask_images(source: Source) -> tuple[str, ...]:
 def _mask_names(source: Source, images: Sequence[str]) -> list[str]:
     """The mask of each image, "" where there is none: a file, or FOLDER/NUMBER_*.png for one in parts."""
     merged = {file for file in source.files if file.endswith(".png") and parent_name(file) == "masks"}
-    in_parts = {int(base_name(name).removesuffix("_*.png")): name for name in parts_of(source)}
+    in_parts = {int(basename(name).removesuffix("_*.png")): name for name in parts_of(source)}
     names = []
     for file in images:
         stem, folders = stem_of(file), file.split("/")[:-2]
@@ -369,7 +369,7 @@ def load_celebamask(source: Source) -> Table | None:
     masks = _mask_names(source, files)
     if not any(masks):
         return None
-    names = [base_name(file) for file in files]
+    names = [basename(file) for file in files]
     labels, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
     if (mapping := source.named(_MAPPING)) is not None:
         expected, header = "idx orig_idx orig_file, as in 0 119613 119614.jpg", r"idx\s+orig_idx\s+orig_file"

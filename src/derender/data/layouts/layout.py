@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from posixpath import basename, dirname
 from typing import Any, TypeVar
 
 import numpy as np
@@ -145,19 +146,14 @@ def in_test_half(name: str) -> bool:
     return hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[0] % 2 == 1
 
 
-def base_name(file: str) -> str:
-    """A file's name without its folders."""
-    return file.rpartition("/")[2]
-
-
 def stem_of(file: str) -> str:
     """A file's name without its folders and its suffix."""
-    return base_name(file).rsplit(".", 1)[0]
+    return basename(file).rsplit(".", 1)[0]
 
 
 def parent_name(file: str) -> str:
     """The name of the folder that a file lies in, "" at the top."""
-    return file.rpartition("/")[0].rpartition("/")[2]
+    return basename(dirname(file))
 
 
 def mostly(pattern: re.Pattern[str], names: Iterable[str]) -> bool:

@@ -6,9 +6,6 @@ Without ``centre`` its bounding box is centred. Without textures each identity h
 colour of NaN is none. Eyes do not look around and lids do not move unless the expressions say so.
 """
 
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +16,7 @@ from jaxtyping import Float32, Int32
 from numpy import ndarray
 
 from derender.data import MASK_CLASSES
+from derender.data.image import DECODER_ERRORS
 from derender.data.synthetic.face_identity import draw_identity
 from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings
@@ -28,10 +26,6 @@ NOSE_TIP_Z = 0.947  # of neutral faces
 _PICTURE_WIDTH = 2.0 * float(np.tan(np.deg2rad(5.0)))  # scene units across the image at z = 1
 _LIMIT = 2.5
 MeshesOf = Callable[[list[Any]], list[TriangleMesh]]
-_DAMAGED = (
-    *(OSError, ValueError, AttributeError, LookupError, EOFError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error, struct.error),
-)
 
 
 @dataclass(frozen=True)
@@ -59,7 +53,7 @@ class MorphableFaces:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
-        except _DAMAGED as problem:
+        except DECODER_ERRORS as problem:
             raise ValueError(f"{path} cannot be read as .npz: {problem}") from problem
         try:
             return _checked(arrays)

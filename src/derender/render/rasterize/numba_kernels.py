@@ -9,16 +9,10 @@ from math import ceil, floor
 import numpy as np
 
 from derender.render.numba_threads import kernel
-from derender.render.rasterize.reference import (
-    EDGE_TOLERANCE,
-    MAX_COORDINATE_PX,
-    MIN_TWICE_AREA_PX2,
-    NEAR_Z,
-    TIE_TOLERANCE,
-)
+from derender.render.rasterize import reference as rule
 
-REACH = 3 * EDGE_TOLERANCE
-TIED = 1 - TIE_TOLERANCE
+REACH = 3 * rule.EDGE_TOLERANCE
+TIED = 1 - rule.TIE_TOLERANCE
 
 
 @kernel
@@ -32,7 +26,7 @@ def project(points, focal, screen):
             inverse_z = 1 / z
             u = np.float64(points[i, j, 0]) * inverse_z * focal + centre_u
             v = np.float64(points[i, j, 1]) * inverse_z * focal + centre_v
-            seen = z > NEAR_Z and abs(u) <= MAX_COORDINATE_PX and abs(v) <= MAX_COORDINATE_PX
+            seen = z > rule.NEAR_Z and abs(u) <= rule.MAX_COORDINATE_PX and abs(v) <= rule.MAX_COORDINATE_PX
             screen[0, i, j] = u
             screen[1, i, j] = v
             screen[2, i, j] = inverse_z if seen else 0.0
@@ -60,7 +54,7 @@ def choose_in(screen, nearest, held, triangle):
                     u0, u1, u2 = us[i0, j0], us[i1, j1], us[i2, j2]
                     v0, v1, v2 = vs[i0, j0], vs[i1, j1], vs[i2, j2]
                     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-                    if not abs(area) > MIN_TWICE_AREA_PX2:
+                    if not abs(area) > rule.MIN_TWICE_AREA_PX2:
                         continue
                     low, high = min(u0, u1, u2), max(u0, u1, u2)
                     margin = REACH * (high - low)
@@ -78,7 +72,7 @@ def choose_in(screen, nearest, held, triangle):
                             weight0 = (du1 * dv2 - du2 * dv1) * scale
                             weight1 = (du2 * dv0 - du0 * dv2) * scale
                             weight2 = (du0 * dv1 - du1 * dv0) * scale
-                            if min(weight0, weight1, weight2) < -EDGE_TOLERANCE:
+                            if min(weight0, weight1, weight2) < -rule.EDGE_TOLERANCE:
                                 continue
                             inverse_depth = weight0 * a0 + weight1 * a1 + weight2 * a2
                             if walk == 1:
