@@ -109,27 +109,21 @@ def make_set(
     focal = np.float32(focal_px(image_size, FOV_DEG))
 
     def draw(indices: list[int]) -> list[tuple[Any, ...]]:
-        groups = groupby(indices, lambda i: i // per_object)
-        run = [shot for _, group in groups for shot in shots(list(group))]
-        light, camera = np.stack([shot.light for shot in run]), np.stack([shot.camera for shot in run])
-        rotation, direction = camera_rotation_and_light(camera, light)
-        rays = np.hstack([light[:, 1:2], direction]).astype(np.float32)
-        generators = [np.random.default_rng([seed, 5, index]) for index in indices]
-        drawn = [effects.draw(own, float(ray[0])) for own, ray in zip(generators, rays, strict=True)]
         rows = []
-        for n, (index, shot, (gloss, haze, more, labels)) in enumerate(zip(indices, run, drawn, strict=True)):
-            out = ImageMaps(*(each[index - first] for each in maps))
-            turn, shift = rotation[n].astype(np.float32), camera[n, 3:]
-            more = np.hstack([more[:, :1], more[:, 1:] @ turn.T])
-            lamps = np.vstack([rays[n], more]).astype(np.float32)
-            lit = (float(light[n, 0]), lamps, gloss, haze, effects.shadows, image_size)
-            lighting = lit_by(shot.mesh, turn, shift, *lit)
+        for index, shot in zip(indices, shots(indices), strict=True):
+            (rotation,), (direction,) = camera_rotation_and_light(shot.camera[None], shot.light[None])
+            turn, shift, (ambient, diffuse) = rotation.astype(np.float32), shot.camera[3:], shot.light[:2]
+            generator = np.random.default_rng([seed, 5, index])
+            gloss, haze, more, labels = effects.draw(generator, float(diffuse))
+            further = np.hstack([more[:, :1], more[:, 1:] @ turn.T])
+            lamps = np.vstack([[diffuse, *direction], further]).astype(np.float32)
+            lit = (float(ambient), lamps, gloss, haze, effects.shadows, image_size)
+            lighting, out = lit_by(shot.mesh, turn, shift, *lit), ImageMaps(*(m[index - first] for m in maps))
             draw_mesh(shot.mesh, turn, shift, lighting, shot.background, focal, out)
             rows.append((*shot[2:5], shot.labels | labels, shot.traits))  # without meshes
         return rows
 
-    whole = per_object * max(1, _LONGEST_RUN // per_object)  # objects where they fit
-    runs = groupby(range(first, first + count), lambda i: (i // whole, i % whole // _LONGEST_RUN))
+    runs = groupby(range(first, first + count), lambda i: (i // per_object, i % per_object // _LONGEST_RUN))
     made: list[tuple[Any, ...]] = []
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for rows in pool.map(draw, [list(indices) for _, indices in runs]):
