@@ -213,18 +213,15 @@ def _bare_skin(
 
 def _brows(who: Identity, grid: FaceGrid, grain: ndarray) -> Float32[ndarray, "rows columns"]:
     """Brows: an arch that is thickest at a third and tapers outwards, with a hairy edge."""
-    mask = np.zeros(grid.p.shape, np.float32)
-    rows = slice(*np.searchsorted(grid.q[:, 0], (-27.0, -14.0)))
-    p, q = np.abs(grid.p[rows]), grid.q[rows]
+    p = np.abs(grid.p)
     along = np.clip((p - 4.6) / 13.2, 0.0, 1.0)
     arch = who["brow_arch"] * 1.6 * np.sin(np.pi * along**1.25)
     centre = -19.8 + 0.5 * (1.0 - along) - arch + 1.3 * along**3
     third = 0.75 + 0.5 * np.sin(np.pi * np.minimum(along * 1.3 + 0.1, 1.0))
     half = who["brow_thickness"] * 1.15 * third * (1.0 - 0.65 * along**1.5)
-    edge = (half - np.abs(q - centre)) / 0.7 + 0.12 * grain[rows]
+    edge = (half - np.abs(grid.q - centre)) / 0.7 + 0.12 * grain
     ends = smoothstep(3.9, 6.2, p) * (1.0 - smoothstep(15.8, 18.6, p))
-    mask[rows] = smoothstep(-0.6, 0.8, edge) * ends
-    return mask
+    return _single(smoothstep(-0.6, 0.8, edge) * ends)
 
 
 def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[ndarray, "rows columns"]:
@@ -265,16 +262,15 @@ def _hair_thickness(shape: FaceShape, style: HairStyle, volume: float, distance:
 
 
 def paint_eyes(
-    albedo: Float32[ndarray, "n 3 rows columns"], parts: Int32[ndarray, "n rows columns"], grid: FaceGrid,
-    who: Identity, lids: Float32[ndarray, "n 2 2"], gaze: Float32[ndarray, "n 2"],
+    albedo: Float32[ndarray, "3 rows columns"], parts: Int32[ndarray, "rows columns"], grid: FaceGrid,
+    who: Identity, lids: Float32[ndarray, "2 2"], gaze: Float32[ndarray, "2"],
 ) -> None:  # fmt: skip
     """Paint one person's eyes in place. lids: how wide and how squinted the eye at p < 0 and that at p > 0
     are; gaze: face pixels."""
     rows, columns = np.abs(grid.q[:, 0] - EYE_Q) < 7.0, np.abs(np.abs(grid.p[0]) - EYE_P) < 8.0
     at = np.ix_(rows, columns)
-    colour, p, y = albedo[:, :, *at], _single(grid.p[:1, columns]), _single(grid.q[rows, :1] - EYE_Q)
-    wide, squint = lids[..., (p[0] > 0).astype(int)].transpose(1, 0, 2)[:, :, None]  # (n, 1, columns)
-    right, down = gaze.T[:, :, None, None]
+    colour, p, y = albedo[:, *at], _single(grid.p[:1, columns]), _single(grid.q[rows, :1] - EYE_Q)
+    (wide, squint), (right, down) = lids[:, (p[0] > 0).astype(int)], gaze
     up = 2.35 * np.clip(who["eye_opening"] * (1.0 + 0.34 * wide - 0.42 * squint), 0.25, 1.7)
     low = 1.4 * np.clip(who["eye_opening"] * (1.0 + 0.2 * wide - 0.45 * squint), 0.2, 1.5)
     outward, length, lashes = np.abs(p) - EYE_P, who["eye_length"], who["lashes"]
@@ -284,12 +280,12 @@ def paint_eyes(
     above_lower = low * body**0.9 * (1.0 + 0.15 * along) - level
     fold = who["lid_crease"] * gauss(below_upper, -1.5, 0.42) * hill(along, 0.0, 1.05, 4)
     lid = gauss(below_upper, -0.9, 0.9) * hill(along, 0.0, 1.1, 4)
-    colour *= ((1.0 - 0.28 * fold) * (1.0 - 0.10 * lid))[:, None]
+    colour *= (1.0 - 0.28 * fold) * (1.0 - 0.10 * lid)
     inside = np.where(body > 0.0, np.minimum(below_upper, above_lower) / 0.45 + 0.5, 0.0)
     distance = np.hypot(p - np.sign(p) * EYE_P - right, level - down + 0.55)
     shade = (1.0 - 0.28 * np.exp(-np.maximum(below_upper, 0.0) / 0.7)) * (1.0 - 0.12 * np.abs(along))
     rim = 1.15 - 0.75 * np.clip((distance - _IRIS_RADIUS + 0.7) / 0.55, 0.0, 1.0)
-    ball, iris = shade[:, None] * _SCLERA, rim[:, None] * _rgb(who["iris"])
+    ball, iris = shade * _SCLERA, rim * _rgb(who["iris"])
     _over(ball, _PINK, 1.6 * (-along - 0.62))
     _over(iris, _PUPIL, (_PUPIL_RADIUS - distance) / 0.35 + 0.5)
     _over(ball, iris, (_IRIS_RADIUS - distance) / 0.4 + 0.5)
@@ -297,19 +293,19 @@ def paint_eyes(
     lash = hill(below_upper, -0.15, 0.40 + 0.20 * lashes * (1.0 + 0.6 * along)) * hill(along, 0.0, 1.02, 8)
     _over(colour, _LASH, 0.95 * lashes * lash)
     _over(colour, _LASH, 0.28 * lashes * hill(above_lower, -0.1, 0.4) * hill(along, 0.0, 0.95, 8))
-    albedo[:, :, *at] = colour
+    albedo[:, *at] = colour
     side = np.where(p > 0, PART["l_eye"], PART["r_eye"])
-    parts[:, *at] = np.where(inside > 0.5, side, parts[:, *at])
+    parts[at] = np.where(inside > 0.5, side, parts[at])
 
 
 def paint_mouth(
-    albedo: Float32[ndarray, "n 3 rows columns"], parts: Int32[ndarray, "n rows columns"], grid: FaceGrid,
-    who: Identity, gap: Float32[ndarray, "n columns"],
+    albedo: Float32[ndarray, "3 rows columns"], parts: Int32[ndarray, "rows columns"], grid: FaceGrid,
+    who: Identity, gap: Float32[ndarray, "columns"],
 ) -> None:  # fmt: skip
-    """Paint one person's open mouths in place; ``gap`` is by how much the lips have parted, face pixels."""
+    """Paint one person's open mouth in place; ``gap`` is by how much the lips have parted, face pixels."""
     rows, columns = np.abs(grid.q[:, 0] - MOUTH_Q) < 1.1 * MOUTH_BAND, np.abs(grid.p[0]) < 9.3
     at = np.ix_(rows, columns)
-    colour, p, gap = albedo[:, :, *at], _single(grid.p[:1, columns]), gap[:, None, columns]
+    colour, p, gap = albedo[:, *at], _single(grid.p[:1, columns]), gap[columns]
     across = _single((grid.q[rows, :1] - MOUTH_Q) / MOUTH_BAND)  # -1 upper lip's edge, 1 lower lip's edge
     lens = np.sqrt(1.0 - (p / 9.3) ** 2)
     below = 0.5 * (across + 1.0) * gap
@@ -324,8 +320,8 @@ def paint_mouth(
     _over(inside, groove * _TOOTH, np.minimum((2.7 - below) / 0.4 + 0.5, 1.0) * shown)
     _over(line, inside, parted)
     _over(colour, line, cover)
-    albedo[:, :, *at] = colour
-    parts[:, *at] = np.where((cover > 0.5) & (parted > 0.5), PART["mouth"], parts[:, *at])
+    albedo[:, *at] = colour
+    parts[at] = np.where((cover > 0.5) & (parted > 0.5), PART["mouth"], parts[at])
 
 
 def _single(values: Any) -> ndarray:
@@ -336,6 +332,6 @@ def _rgb(values: Any) -> Float32[ndarray, "3 1 1"]:
     return _single(values)[:, None, None]
 
 
-def _over(under: Float32[ndarray, "*n 3 rows columns"], colour: ndarray, alpha: ndarray) -> None:
+def _over(under: Float32[ndarray, "3 rows columns"], colour: ndarray, alpha: ndarray) -> None:
     """Lay a colour over another, in place; the opacity is cut to 0..1."""
-    under += (colour - under) * _single(np.minimum(np.maximum(alpha, 0.0), 1.0))[..., None, :, :]
+    under += (colour - under) * _single(np.minimum(np.maximum(alpha, 0.0), 1.0))

@@ -34,7 +34,7 @@ from derender.data.synthetic.face_skin import (
     skin_fields,
 )
 from derender.data.synthetic.mesh_image import TriangleMesh
-from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshesOf, MorphableFaces
+from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshOf, MorphableFaces
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
 
@@ -59,11 +59,10 @@ def generate(
 
     def shots(indices: list[int]) -> Iterator[Shot]:
         number = settings.first_identity + indices[0] // settings.per_identity
-        meshes_of, known, traits = family.person(seed, number, settings)
-        draws = [draw_face(seed, index, image_size, settings) for index in indices]
-        meshes = meshes_of([expression for expression, *_ in draws])
-        for mesh, (_, background, light, camera, labels) in zip(meshes, draws, strict=True):
-            yield Shot(mesh, background, light, camera, number, labels | known, traits)
+        mesh_of, known, traits = family.person(seed, number, settings)
+        for index in indices:
+            expression, background, light, camera, labels = draw_face(seed, index, image_size, settings)
+            yield Shot(mesh_of(expression), background, light, camera, number, labels | known, traits)
 
     size = settings.per_identity
     return make_set(shots, count, image_size, seed, first, size, MASK_CLASSES, progress, settings.effects)
@@ -136,8 +135,8 @@ class ProceduralFaces:
     shape: FaceShape
     fields: dict[str, ndarray]
 
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshesOf, Row, Row]:
-        """One identity: its meshes by expressions, its labels, and its traits for tables."""
+    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshOf, Row, Row]:
+        """One identity: its mesh by expression, its labels, and its traits for tables."""
         shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
         who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
         skin = paint_skin(who, shape, self.fields)
@@ -153,30 +152,24 @@ class ProceduralFaces:
         labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
         labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
         surface *= np.float32(who["scale"])
-        return partial(self._meshes, who, surface, tip, skin), labels, identity_columns(who)
+        return partial(self._mesh, who, surface, tip, skin), labels, identity_columns(who)
 
-    def _meshes(
-        self, who: Identity, surface: Float32[ndarray, "rows columns 3"], nose_tip: float, skin: Skin,
-        expressions: list[Expression],
-    ) -> list[TriangleMesh]:  # fmt: skip
-        """A neutral surface (face pixels) with each expression, in scene units; eyes and mouths painted."""
-        grid, scale, count = self.shape.grid, np.float32(who["scale"]), len(expressions)
-        surfaces, albedo, parts = (
-            np.repeat(each[None], count, axis=0) for each in (surface, skin.albedo, skin.parts)
-        )
-        sides = np.stack([expression.sides for expression in expressions])
-        for n, a, side in np.argwhere(sides[:, : len(ACTIONS)]):
+    def _mesh(
+        self, who: Identity, neutral: Float32[ndarray, "rows columns 3"], nose_tip: float, skin: Skin,
+        expression: Expression,
+    ) -> TriangleMesh:  # fmt: skip
+        """A neutral surface (face pixels) with an expression, in scene units; eyes and mouth painted."""
+        grid, scale, sides = self.shape.grid, np.float32(who["scale"]), expression.sides
+        surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
+        for a, side in np.argwhere(sides[: len(ACTIONS)]):
             displacement, box = self.shape.actions[2 * a + side]
-            surfaces[n][box] += sides[n, a, side] * scale * displacement
+            surface[box] += sides[a, side] * scale * displacement
         top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
-        gap = (surfaces[:, bottom, :, 1] - surfaces[:, top - 1, :, 1]) / scale
-        paint_mouth(albedo, parts, grid, who, gap)
-        gaze = np.stack([expression.gaze for expression in expressions])
-        paint_eyes(albedo, parts, grid, who, sides[:, len(ACTIONS) :], gaze)
-        surfaces += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
-        surfaces *= np.float32(FACE_PX)
-        surfaces[..., 2] += np.float32(NOSE_TIP_Z)
-        surfaces[..., 2] -= 1.0
-        colours = np.ascontiguousarray(albedo.reshape(count, 3, -1).transpose(0, 2, 1))
-        vertices, parts = surfaces.reshape(count, -1, 3), parts.reshape(count, -1)
-        return [TriangleMesh(vertices[n], self.shape.triangles, colours[n], parts[n]) for n in range(count)]
+        paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
+        paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
+        surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
+        surface *= np.float32(FACE_PX)
+        surface[..., 2] += np.float32(NOSE_TIP_Z)
+        surface[..., 2] -= 1.0
+        colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
+        return TriangleMesh(surface.reshape(-1, 3), self.shape.triangles, colours, parts.ravel())

@@ -25,7 +25,7 @@ from derender.data.synthetic.synthetic_set import Row
 NOSE_TIP_Z = 0.947  # of neutral faces
 _PICTURE_WIDTH = 2.0 * float(np.tan(np.deg2rad(5.0)))  # scene units across the image at z = 1
 _LIMIT = 2.5
-MeshesOf = Callable[[list[Any]], list[TriangleMesh]]
+MeshOf = Callable[[Any], TriangleMesh]
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class MorphableFaces:
         except ValueError as problem:
             raise ValueError(f"{path}: {problem}") from problem
 
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshesOf, Row, Row]:
-        """One identity, its coefficients from normals clipped at 2.5 sd: meshes by expressions (of a ``name``
+    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshOf, Row, Row]:
+        """One identity, its coefficients from normals clipped at 2.5 sd: its mesh by expression (of ``name``
         and ``strength``), labels, and traits for tables."""
         generator = np.random.default_rng([seed, 2, identity])
         normal = np.clip(generator.standard_normal(len(self.std)), -_LIMIT, _LIMIT)
@@ -78,11 +78,11 @@ class MorphableFaces:
         traits: Row = {f"shape_{k:03d}": float(value) for k, value in enumerate(coefficients)}
         known, still = self.expressions, np.zeros(3, np.float32)
 
-        def meshes(expressions: list[Any]) -> list[TriangleMesh]:
-            moved = (surface + np.float32(one.strength) * known.get(one.name, still) for one in expressions)
-            return [TriangleMesh(points, self.triangles, albedo, self.parts) for points in moved]
+        def mesh(expression: Any) -> TriangleMesh:
+            moved = surface + np.float32(expression.strength) * known.get(expression.name, still)
+            return TriangleMesh(moved, self.triangles, albedo, self.parts)
 
-        return meshes, labels, traits
+        return mesh, labels, traits
 
 
 def _checked(arrays: dict[str, ndarray]) -> MorphableFaces:
