@@ -60,8 +60,7 @@ class FaceShape:
     reach: Float[ndarray, "rows 1"]  # half width of the bare head
     names: tuple[str, ...]  # of the modes: one displacement per trait of shape
     modes: Float[ndarray, "modes rows columns 3"]
-    # left and right half of each of ``ACTIONS``: displacement, and the rows and columns that it moves
-    actions: list[tuple[ndarray, tuple[slice, slice]]]
+    actions: list[Float[ndarray, "rows columns 3"]]  # displacement by left and right half of each of ACTIONS
 
 
 @lru_cache(maxsize=4)
@@ -74,10 +73,7 @@ def face_shape(detail: float = 1.0) -> FaceShape:
     for name in ACTIONS:
         whole = _displacement(grid, fields, numbers["actions"][name])
         for half in (whole * left, whole * (1.0 - left)):
-            moved = np.abs(half) >= _TOO_LITTLE
-            rows, columns = (np.flatnonzero(moved.any(axis=axes)) for axes in ((1, 2), (0, 2)))
-            box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-            actions.append(((half * moved)[box].astype(np.float32), box))
+            actions.append(np.where(np.abs(half) >= _TOO_LITTLE, half, 0.0).astype(np.float32))
     modes = [_displacement(grid, fields, terms) for terms in numbers["modes"].values()]
     normal = unit(np.cross(np.gradient(head, axis=0), np.gradient(head, axis=1)))
     level = np.stack([np.sin(grid.theta), np.zeros(grid.p.shape), -np.cos(grid.theta)], axis=-1)

@@ -162,8 +162,7 @@ class ProceduralFaces:
         grid, scale, sides = self.shape.grid, np.float32(who["scale"]), expression.sides
         surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
         for a, side in np.argwhere(sides[: len(ACTIONS)]):
-            displacement, box = self.shape.actions[2 * a + side]
-            surface[box] += sides[a, side] * scale * displacement
+            surface += sides[a, side] * scale * self.shape.actions[2 * a + side]
         top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
         paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
         paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
