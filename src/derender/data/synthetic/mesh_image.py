@@ -155,11 +155,7 @@ def fill_triangles(places, triangles, number, more, holes, nearest, owner):
         to_below = ((cw - aw) * abx - (bw - aw) * acx) * scale
         low, high = min(aw, bw, cw), max(aw, bw, cw)
         ab, bc, ca = _edge(ax, ay, bx, by), _edge(bx, by, cx, cy), _edge(cx, cy, ax, ay)
-        pierced = False  # whether a hole is as far along as the triangle
-        for h in range(2 if len(number) else 0):
-            at, reach = holes[number[f], h, 0], holes[number[f], h, 2]
-            p, q, r = more[a, 3] - at, more[b, 3] - at, more[c, 3] - at
-            pierced = pierced or (reach > _ZERO and min(p, q, r) < reach and max(p, q, r) > -reach)
+        pierced = len(number) > 0 and holes[number[f], 0, 2] > _ZERO  # whether its surface has holes
         for v in range(first_row, last_row + 1):
             row = np.float32(v)
             at_ab, at_bc, at_ca = _crossing(ab, row), _crossing(bc, row), _crossing(ca, row)
