@@ -134,14 +134,11 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
 
 def smooth_grid(points: Float[ndarray, "r c 3"], chart: Float[ndarray, "r c 2"], surface: Surface) -> Grid:
     """A grid whose normals are area-weighted means of the cells around each vertex."""
-    p = np.moveaxis(points * _DOWN, -1, 0).copy()
-    a, b = p[:, 1:, 1:] - p[:, :-1, :-1], p[:, 1:, :-1] - p[:, :-1, 1:]
-    cells = np.zeros((3, p.shape[1] + 1, p.shape[2] + 1))
-    cells[:, 1:-1, 1:-1] = a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
-    rows = cells[:, 1:] + cells[:, :-1]
-    normals = rows[..., 1:] + rows[..., :-1]
-    normals /= np.maximum(np.sqrt((normals**2).sum(axis=0)), 1e-12)
-    return Grid(points, np.moveaxis(normals, 0, -1), chart, surface)
+    p = points * _DOWN
+    cells = np.cross(p[1:, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, 1:])
+    around = np.pad(cells, ((1, 1), (1, 1), (0, 0)))
+    rows = around[1:] + around[:-1]
+    return Grid(points, unit(rows[:, 1:] + rows[:, :-1]), chart, surface)
 
 
 def rounded_box(

@@ -98,7 +98,7 @@ def model_car(seed: int, number: int, settings: CarSettings | None = None) -> Ca
     traits = draw_traits(class_of(seed, number, settings), np.random.default_rng([seed, 5, number]))
     mesh = build_car(traits)
     upright = mesh.vertices.astype(np.float64)
-    low, high = np.array([(axis.min(), axis.max()) for axis in np.ascontiguousarray(upright.T)]).T
+    low, high = upright.min(axis=0), upright.max(axis=0)
     centred = (upright - 0.5 * (low + high)) * (settings.size / np.linalg.norm(high - low))
     turn = about_x(CANONICAL_ELEVATION_DEG).T
     vertices, normals = ((points @ turn).astype(np.float32) for points in (centred, mesh.normals))
