@@ -57,11 +57,7 @@ def read_cache(
         count = len(content["files"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
-    if (
-        note.get("fingerprint") != fingerprint
-        or end - length != count * 3 * image_size * image_size
-        or not count
-    ):
+    if note.get("fingerprint") != fingerprint or not end - length == count * 3 * image_size**2 > 0:
         return None
     images = np.memmap(file, np.uint8, mode="c", shape=(count, 3, image_size, image_size))
     return (images, content) if sample_checksum(images) == checksum else None

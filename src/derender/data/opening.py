@@ -180,9 +180,8 @@ def open_images(
         try:
             stream = HuggingFaceStream(str(source), place, split=part, **options)
         except ValueError as problem:
-            raise ValueError(
-                f"{place} does not exist here{nearest_sibling(path)}; and {problem}"
-            ) from problem
+            here = f"{place} does not exist here{nearest_sibling(path)}"
+            raise ValueError(f"{here}; and {problem}") from problem
     else:
         raise ValueError(f"{place!r} is no folder here and no id of a Hugging Face data set (OWNER/NAME)")
     stream.limit = limit

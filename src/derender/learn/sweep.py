@@ -26,13 +26,7 @@ from derender.data import ImageSet
 from derender.data.source import stamps_of
 from derender.evaluation.clustering import clustering_tables, compare_clusterings
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
-from derender.evaluation.feature_rows import (
-    FeatureRow,
-    architecture,
-    chosen_labels,
-    control_rows,
-    prepare,
-)
+from derender.evaluation.feature_rows import FeatureRow, architecture, chosen_labels, control_rows, prepare
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_prepared, linear_tables
 from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options, aligned

@@ -34,25 +34,6 @@ class FactorNet(nn.Module):
 
 
 @dataclass(frozen=True)
-class Factor:
-    """One row: what the factor is called, how it is predicted, what it means and how it is perturbed.
-
-    ``perturb`` draws, for each row, another physically possible value; None if LOOCC never perturbs it.
-    """
-
-    name: str  # key of the network and of the feature column
-    parameter: str  # the field of `Scene` (or key of ``Scene.extra``) that it fills
-    build: Callable[[NetworkSettings], FactorNet]  # makes the factor's network
-    to_parameter: Callable[[Tensor, SceneRanges], Tensor]  # gives a raw network output its physical range
-    mirrored: bool  # whether the parameter is a map that the flipped twin of a scene shows mirrored
-    perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
-    numbers: tuple[
-        "Number", ...
-    ] = ()  # each column for reports and sliders; none of a map, no mirror changes
-    rate: float = 1.0  # share of the learning rate at which its network is trained
-
-
-@dataclass(frozen=True)
 class Number:
     """One number of a factor: its name in reports, its range, and whether it is even in its logarithm.
 
@@ -70,6 +51,23 @@ class Number:
         if self.log:
             return self.low * (self.high / self.low) ** share
         return self.low + (self.high - self.low) * share
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One row: what the factor is called, how it is predicted, what it means and how it is perturbed.
+
+    ``perturb`` draws, for each row, another physically possible value; None if LOOCC never perturbs it.
+    """
+
+    name: str  # key of the network and of the feature column
+    parameter: str  # the field of `Scene` (or key of ``Scene.extra``) that it fills
+    build: Callable[[NetworkSettings], FactorNet]  # makes the factor's network
+    to_parameter: Callable[[Tensor, SceneRanges], Tensor]  # gives a raw network output its physical range
+    mirrored: bool  # whether the parameter is a map that the flipped twin of a scene shows mirrored
+    perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
+    numbers: tuple[Number, ...] = ()  # each column for reports and sliders; none of a map, no mirror changes
+    rate: float = 1.0  # share of the learning rate at which its network is trained
 
 
 def numbers_factor(name: str, *numbers: Number, rate: float = 1.0) -> Factor:

@@ -309,11 +309,8 @@ def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.nd
     """The boxes of a list that the user made; an image without a row or with an empty box is an error."""
     columns = _SIZED if "width" in header_of(source, file) else _SIDES
     rows = read_csv(source, file, ("file", *columns))
-    listed = _OwnersList(
-        f"{file} in {source.path}",
-        columns,
-        {basename(row["file"]): [row[c] for c in columns] for row in rows},
-    )
+    by_name = {basename(row["file"]): [row[column] for column in columns] for row in rows}
+    listed = _OwnersList(f"{file} in {source.path}", columns, by_name)
     if missing := [name for name in names if name not in listed.rows]:
         raise ValueError(
             f"{listed.where} has no row for {missing[0]} ({len(missing):,} of {len(names):,} images have "

@@ -181,10 +181,7 @@ def load_cars(source: Source) -> Table | None:
     labels: Labels = {"model": text_column(models)} if any(models) else {}
     if (table := _table_of(source)) is not None:
         known = {
-            row["fullId"].rpartition(".")[2]: (
-                row["name"],
-                car_class(row["name"], row["tags"], row["wnlemmas"]),
-            )
+            row["fullId"].rpartition(".")[2]: (row["name"], _car_class(row))
             for row in read_csv(source, table, ("fullId", "wnlemmas", "name", "tags"))
         }
         if not known.keys() & set(models):
@@ -202,9 +199,9 @@ def load_cars(source: Source) -> Table | None:
     return Table(files, labels, partition, boxes)
 
 
-def car_class(*texts: str) -> str:
-    """The class of a car whose name, tags and the like are these: a key of ``CAR_CLASSES``, or ""."""
-    text = " , ".join(texts).lower().replace("_", " ")
+def _car_class(row: Mapping[str, str]) -> str:
+    """The class of a car in a row of ShapeNet's table: a key of ``CAR_CLASSES``, or ""."""
+    text = " , ".join(row[name] for name in ("name", "tags", "wnlemmas")).lower().replace("_", " ")
     for kind, words in CAR_CLASSES.items():
         if re.search(rf"\b({'|'.join(words)})s?\b", text):
             return kind

@@ -225,11 +225,8 @@ def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
     low = np.minimum(stations.astype(int), _LAST - 1)
     slope = np.diff(table, axis=0)
     inside = np.maximum(0.0, corners - np.abs(stations[:, None] - np.arange(1, _LAST)))
-    rows = (
-        table[low]
-        + slope[low] * (stations - low)[:, None]
-        + inside**2 / (4.0 * corners) @ np.diff(slope, axis=0)
-    )
+    rows = table[low] + slope[low] * (stations - low)[:, None]
+    rows += inside**2 / (4.0 * corners) @ np.diff(slope, axis=0)
     shoulder = np.clip((_from_ends(stations) - 1.3) / 0.6, 0.0, 1.0) * (1.0 - _cabin(stations))
     for wheel_at in (shape.front_wheel, shape.rear_wheel):
         lack = (1.0 + ARCH) * shape.wheel + 0.07 - rows[:, 7]

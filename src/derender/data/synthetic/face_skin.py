@@ -175,9 +175,8 @@ def paint_skin(who: Identity, shape: FaceShape, fields: dict[str, ndarray]) -> S
     distance = _hair_distance(grid, style, who) + 0.5 * fields["strands"] + 0.9 * style.curl * fields["curls"]
     hair = style.cover * smoothstep(-0.8, 0.9 if style.fall > 2.0 or style.covers_ears else 2.2, distance)
     lift, forward = _hair_thickness(shape, style, who["hair_volume"], distance)
-    lift = lift * (1.0 + style.curl * 0.22 * fields["curls"]) + 0.03 * fields["strands"] * np.clip(
-        lift, 0.0, 1.5
-    )
+    uneven = 0.03 * fields["strands"] * np.clip(lift, 0.0, 1.5)
+    lift = lift * (1.0 + style.curl * 0.22 * fields["curls"]) + uneven
     if not style.covers_ears:
         hair, lift = hair * (1.0 - fields["is_ear"]), lift * (1.0 - fields["is_ear"])
     root = 1.0 - 0.25 * smoothstep(0.0, 3.0, 3.0 - np.abs(distance))

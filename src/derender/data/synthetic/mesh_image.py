@@ -262,10 +262,8 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, neare
             if painted or s == _MIDDLE or not plain:
                 x, y, z = _blend_three(more, 0, at)
                 scale = _ONE / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-20))
-                cosine, normal = (
-                    (x * lamp[1] + y * lamp[2] + z * lamp[3]) * scale,
-                    (x * scale, y * scale, z * scale),
-                )
+                cosine = (x * lamp[1] + y * lamp[2] + z * lamp[3]) * scale
+                normal = (x * scale, y * scale, z * scale)
                 depth = _ONE / _blend(places, 2, at)
             if not painted:
                 cosine = _blend(more, 6, at)

@@ -158,9 +158,8 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
     coloured = np.float32(0.3) * strength * (knots - np.float32(0.5))
     knots = np.clip(start + (end - start) * knots[..., :1] + coloured, 0.0, 1.0)
     at = np.linspace(0.0, _NOISE_CELLS - 1.0, size, dtype=np.float32)[:, None]
-    near = np.maximum(
-        np.float32(1.0) - np.abs(at - np.arange(_NOISE_CELLS, dtype=np.float32)), np.float32(0.0)
-    )
+    apart = np.abs(at - np.arange(_NOISE_CELLS, dtype=np.float32))
+    near = np.maximum(np.float32(1.0) - apart, np.float32(0.0))
     share = near * near * (np.float32(3.0) - np.float32(2.0) * near)  # (size, cells)
     return share @ (share @ knots.reshape(_NOISE_CELLS, -1)).reshape(size, _NOISE_CELLS, 3)
 
