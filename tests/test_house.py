@@ -32,10 +32,10 @@ BUDGET = {  # lines, files
     "postprocess": (850, 4),  # features of the canonical view
     "scene": (860, 11),
     "demo": (490, 3),  # the light of the last portrait
-    "renderers": (660, 8),
+    "renderers": (651, 8),
     "learn": (935, 5),
 }
-TOTAL = (39_186, 240)  # on the way to (37_000, 270)
+TOTAL = (39_066, 240)  # on the way to (37_000, 270)
 TEST_LINES = 26_191
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
