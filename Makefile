@@ -81,6 +81,7 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace, CelebA and Yale B: make 
 	  --fit-steps 20 --keep-duplicates --out build/lfw-fitted.parquet
 	@test -d build/faces-unet || $(BIN)/derender unet $(IMAGES)/utkface64.zip --model faces-64 --out build/faces-unet \
 	  --set images=96000 --set precision=bf16-mixed
+	@test -f build/lfw-aligned/boxes.csv || $(BIN)/derender align $(IMAGES)/lfw128.zip --out build/lfw-aligned --largest --keep
 	@for step in "lfw evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW)" \
 	  "lfw-fitted evaluate cluster --features build/lfw-fitted.parquet $(LFW)" \
 	  "lfw-finch evaluate cluster $(IMAGES)/lfw64.zip --model faces-64 $(LFW) --method finch" \
@@ -96,6 +97,7 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace, CelebA and Yale B: make 
 	  "light-optimised evaluate light $(IMAGES)/yaleb.zip --half test --model faces-64 --fit-steps 10" \
 	  "relighting evaluate relight $(IMAGES)/yaleb.zip --half test --model faces-64" \
 	  "verification evaluate verify $(IMAGES)/lfw64.zip --pairs $(IMAGES)/pairs.txt --half test --model faces-64" \
+	  "verification-aligned evaluate verify build/lfw-aligned --pairs $(IMAGES)/pairs.txt --half test --model faces-64" \
 	  "brightness-races evaluate brightness $(IMAGES)/utkface64.zip --model faces-64 --by race --limit 2000" \
 	  "compare-linear compare --table linear --model faces-64 $(IMAGES)/celeba64.zip --finetune --supervised --seeds 1 --untrained-seeds 1" \
 	  "compare-identity compare --table identity --model faces-64 $(IMAGES)/lfw64.zip" \

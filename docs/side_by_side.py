@@ -67,6 +67,7 @@ HEADS_FILE, FITTED = "generated/heads.json", "generated/heads-fitted.json"
 AT_128, CARS = "generated/heads-128.json", "generated/cars-geometry.json"
 GEOMETRY, TRUE = "intervals geometry", "intervals factors"
 AVERAGE = ("average depth", "constant answer")
+ALIGNED = "published/verification-aligned.json"
 LFW, LFW_FITTED = "published/lfw.json", "published/lfw-fitted.json"
 UTK_IMAGES, LFW_IMAGES = "published/reconstruction-utkface.json", "published/reconstruction-lfw.json"
 BRIGHT, IDENTITY = "generated/brightness.json", "published/identity.json"
@@ -107,6 +108,16 @@ SIDE_BY_SIDE: dict[str, tuple[str, Reader]] = {
             *lines(
                 *PLAIN, *(f"{name} with mirror image" for name in DESCRIPTORS), "LBP", "majority", "chance"
             ),
+        ],
+    ),
+    "aligned": side_by_side(
+        {
+            "accuracy": Score(ALIGNED, "rows", "accuracy", intervals=True),
+            "area under the curve": Score(ALIGNED, "rows", "auc", intervals=True),
+        },
+        [
+            *lines("geometry + albedo", control=False),
+            *lines(*PLAIN, *(f"{name} with mirror image" for name in DESCRIPTORS), "chance"),
         ],
     ),
     "identity": side_by_side(

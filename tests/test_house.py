@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_705, 15),  # unwarp
     "features": (1_302, 8),  # a folder is refused before images are embedded
     "interpretation": (1_080, 5),  # maps of features of the canonical view
-    "photo": (1_660, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
+    "photo": (1_672, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
     "networks": (710, 5),
     "storage": (955, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (651, 8),
     "learn": (935, 5),
 }
-TOTAL = (39_066, 240)  # on the way to (37_000, 270)
-TEST_LINES = 26_191
+TOTAL = (39_078, 240)  # on the way to (37_000, 270)
+TEST_LINES = 26_200
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

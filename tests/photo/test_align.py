@@ -11,6 +11,7 @@ from PIL import Image
 
 import derender
 from derender.cli import main
+from derender.data import read_photo
 from derender.data.synthetic import faces
 from derender.data.synthetic.settings import FaceSettings
 from derender.photo import Face, Frame, find_faces
@@ -111,6 +112,14 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
     assert main([*words, "--force"]) == 0
     assert "1 face in 3 photographs; no face in 1, 1 rejected" in capsys.readouterr().out
     assert not (tmp_path / "a" / "two" / "pair-2.png").exists()
+    assert main([*words, "--force", "--keep"]) == 0
+    assert "1 face in 3 photographs; no face in 1, 1 rejected" in capsys.readouterr().out
+    kept = tmp_path / "a" / "none.png"
+    assert read_photo(kept).shape == (256, 256, 3)
+    assert "\nnone.png,none.png,no face found," in (tmp_path / "a" / "boxes.csv").read_text().replace(
+        "\r", ""
+    )
+    assert main([*words, "--force"]) == 0 and not kept.exists()
     (tmp_path / "mine.png").write_bytes(b"kept")
     text = (tmp_path / "a" / "boxes.csv").read_text().replace("two/pair.png,", "../mine.png,", 1)
     (tmp_path / "a" / "boxes.csv").write_text(text)

@@ -17,6 +17,7 @@ def align(
         0.0, "More of the surroundings on every side, in shares of the side.", min=0, max=2
     ),
     largest: bool = option(False, "Only the largest face of each photograph.", "--largest"),
+    keep: bool = option(False, "Of photographs without a face, keep the middle square.", "--keep"),
 ) -> None:
     """Find every face of photographs, and write it upright and centred, as models of faces take it.
 
@@ -27,8 +28,8 @@ def align(
 
     with progress_bar("searching", "photographs") as report:
         done = derender.align(
-            photos.address, out, model=model, size=size, margin=margin, largest=largest, **photos.how,
-            overwrite=output.force, progress=report,
+            photos.address, out, model=model, size=size, margin=margin, largest=largest, keep=keep,
+            **photos.how, overwrite=output.force, progress=report,
         )  # fmt: skip
     output.result(f"{done.describe()} in {out}")
     output.write({"out": out, **done.counts, "resumed": done.resumed, "boxes": done.rows})

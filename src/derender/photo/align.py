@@ -59,7 +59,8 @@ class Aligned:
     @property
     def counts(self) -> dict[str, int]:
         """Photographs, faces, photographs without a face, rejected boxes, and unreadable files."""
-        faces, photos = [row for row in self.rows if row["file"]], {row["photo"] for row in self.rows}
+        faces = [row for row in self.rows if row["file"] and not row["rejected"]]
+        photos = {row["photo"] for row in self.rows}
         unreadable = sum(row["rejected"].startswith(UNREADABLE) for row in self.rows)
         return {
             "photographs": len(photos),
@@ -81,7 +82,7 @@ class Aligned:
 
 def align(
     photos: Stream | str | Path, out: str | Path, *, model: Derenderer | str | Path | None = None,
-    size: int = 256, margin: float = 0.0, largest: bool = False, dataset: str = "auto",
+    size: int = 256, margin: float = 0.0, largest: bool = False, keep: bool = False, dataset: str = "auto",
     limit: int | None = None, overwrite: bool = False, progress: Progress | None = None,
 ) -> Aligned:  # fmt: skip
     """Cut every face of photographs out, upright, where UTKFace or a model of faces has it.
@@ -94,6 +95,7 @@ def align(
         size: side of the crops in pixels.
         margin: more of the surroundings on every side, in shares of the side.
         largest: only the largest face of each photograph.
+        keep: of photographs without a face, write the middle square.
         dataset, limit: how the photographs are read.
         overwrite: replace what an earlier run made; without, a stopped run is continued.
         progress: called with (photographs done, in all).
@@ -104,7 +106,7 @@ def align(
     """
     if not (8 <= size <= 4096 and 0 <= margin <= 2):
         raise ValueError(f"size must be 8 to 4096 and margin 0 to 2, got {size} and {margin:g}")
-    cutter = _Cutter(Path(out), size, margin, largest, *_known(model))
+    cutter = _Cutter(Path(out), size, margin, largest, keep, *_known(model))
     boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"
     if boxes.exists() and not overwrite:
         raise FileExistsError(f"{boxes} exists already: choose another folder, or replace it (--force)")
@@ -115,6 +117,7 @@ def align(
         raise ValueError(f"{out} is among the photographs, so crops would be read as such: move it out")
     with stream:
         plan = {"photos": stream.place, "size": size, "margin": margin, "largest": largest, "limit": limit}
+        plan |= {"keep": True} if keep else {}
         plan["model"] = None if model is None else str(getattr(model, "source", model))
         if overwrite:
             for row in [row for file in (boxes, partial) for row in _read(file)[1]]:
@@ -159,6 +162,7 @@ class _Cutter:
     size: int
     margin: float
     largest: bool
+    keep: bool
     template: Template
     model: Derenderer | None
     held_out: HeldOutErrors | None
@@ -184,13 +188,20 @@ class _Cutter:
             frame = Frame(frame.x, frame.y, frame.side * (1 + 2 * self.margin), frame.roll_deg)
             if not row["rejected"]:
                 accepted += 1
-                row["file"] = self._name(str(PurePosixPath(name).with_suffix("")), accepted)
-                with atomic_file(self.out / row["file"]) as temporary:
-                    cut = frame.cut(pixels, self.size).transpose(1, 2, 0)
-                    Image.fromarray(np.ascontiguousarray(cut)).save(temporary, format="PNG")
+                row["file"] = self._write(pixels, frame, name, accepted)
             yield row | _place(face, frame, self.size)
         if not accepted:
-            yield {"photo": name, "rejected": NO_FACE}
+            middle = Frame.centred(pixels.shape[1], pixels.shape[0])
+            kept = {"file": self._write(pixels, middle, name, 1)} if self.keep else {}
+            yield {"photo": name, "rejected": NO_FACE, **kept}
+
+    def _write(self, pixels: np.ndarray, frame: Frame, photo: str, number: int) -> str:
+        """Write a part of a photograph as the face of that number; the name of its file."""
+        file = self._name(str(PurePosixPath(photo).with_suffix("")), number)
+        with atomic_file(self.out / file) as temporary:
+            cut = frame.cut(pixels, self.size).transpose(1, 2, 0)
+            Image.fromarray(np.ascontiguousarray(cut)).save(temporary, format="PNG")
+        return file
 
     def _name(self, stem: str, number: int) -> str:
         """A crop's name that no other has: images may differ in their suffix only, or be numbered."""
