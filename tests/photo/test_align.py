@@ -116,9 +116,9 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
     assert "1 face in 3 photographs; no face in 1, 1 rejected" in capsys.readouterr().out
     kept = tmp_path / "a" / "none.png"
     assert read_photo(kept).shape == (256, 256, 3)
-    assert "\nnone.png,none.png,no face found," in (tmp_path / "a" / "boxes.csv").read_text().replace(
-        "\r", ""
-    )
+    assert "\nnone.png,none.png,no face found,,,,,,320.0,240.0,480.0,0.0,1.875," in (
+        tmp_path / "a" / "boxes.csv"
+    ).read_text().replace("\r", "")
     assert main([*words, "--force"]) == 0 and not kept.exists()
     (tmp_path / "mine.png").write_bytes(b"kept")
     text = (tmp_path / "a" / "boxes.csv").read_text().replace("two/pair.png,", "../mine.png,", 1)

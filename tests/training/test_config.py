@@ -7,8 +7,8 @@ import pytest
 import torch
 import yaml
 
-from derender.overrides import checked
-from derender.training.config import PRESETS, TrainConfig, resolve, setting_names, to_yaml
+from derender.overrides import checked, settings_by_name
+from derender.training.config import PRESETS, TrainConfig, resolve, to_yaml
 from derender.training.derender_task import DerenderTask
 
 
@@ -62,7 +62,7 @@ def test_an_unknown_preset_names_the_nearest_and_an_unknown_key_in_a_file_is_ref
 
 
 def test_every_setting_has_a_name_that_resolves():
-    for name in setting_names():
+    for name in settings_by_name(TrainConfig().model_dump(mode="json")):
         value = TrainConfig().model_dump(mode="json")
         for part in name.split("."):
             value = value[part]

@@ -8,12 +8,33 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Annotated
 
 import typer
 
 from derender import __version__
+from derender.cli import (
+    align,
+    bench,
+    compare,
+    copies,
+    decompose,
+    demo,
+    distil,
+    doctor,
+    edits,
+    embed,
+    evaluate,
+    explain,
+    finetune,
+    importing,
+    models,
+    report,
+    search,
+    synth,
+    train,
+    view,
+)
 from derender.cli.console import damage_as_notices, visible
 
 app = typer.Typer(
@@ -51,17 +72,13 @@ def _options(
     pass
 
 
-_COMMANDS = (
-    "demo.demo", "align.align", "doctor.doctor", "train.train", "copies.whiten", "distil.refine",
-    "distil.unet", "models.pack", "embed.embed", "evaluate", "explain.explain", "finetune.finetune",
-    "importing.import_checkpoint", "compare.compare", "models.models", "report.report", "decompose.decompose",
-    "edits.relight", "edits.rotate", "edits.swap", "decompose.mesh", "search.search", "view.view", "synth",
-    "bench.bench",
-)  # fmt: skip
-for one in _COMMANDS:  # a group of commands is a module
-    module, _, name = one.partition(".")
-    home = import_module(f"derender.cli.{module}")
-    (getattr(home, name) if name else home).register(app)
+for one in (
+    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet,
+    models.pack, embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint,
+    compare.compare, models.models, report.report, decompose.decompose, edits.relight, edits.rotate,
+    edits.swap, decompose.mesh, search.search, view.view, synth, bench.bench,
+):  # fmt: skip
+    one.register(app)
 _command = typer.main.get_command(app)
 
 

@@ -22,6 +22,7 @@ from derender.storage import places
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
+    from derender.report.editing import Edited
     from derender.report.opening import ImageOpener, OpenedImage
 
 BUNDLED = ", ".join(places.bundled_models())
@@ -241,7 +242,7 @@ class ImageFiles:
         return single_suffix(self.out)
 
     def edit(
-        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Any]", output: ImageOutput, **how: Any
+        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: ImageOutput, **how: Any
     ) -> None:
         """Edit, write and report every image; exit code 2 where one that was named cannot be read.
 

@@ -138,11 +138,6 @@ def component_count(images: int) -> int:
     return max(1, min(COMPONENTS, images // 4))
 
 
-def evenly(count: int, most: int = COMPONENT_IMAGES) -> np.ndarray:
-    """At most so many of ``count`` row numbers, evenly apart."""
-    return np.linspace(0, count - 1, min(count, most)).astype(int)
-
-
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:
     """uint8 images (N, 3, H, W) from the principal components of (M, 3, H, W) others alone, in 0..1."""
     with np.errstate(invalid="ignore"):  # a single image has no variance

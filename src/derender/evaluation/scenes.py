@@ -16,10 +16,16 @@ import numpy as np
 
 from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, read_ground_truth
+from derender.data.source import evenly_spaced
 from derender.evaluation.bootstrap import numbers_of
 from derender.evaluation.image_scores import ImageResult
 from derender.evaluation.options import Options
-from derender.evaluation.pixels import ReconstructionResult, evaluate_reconstruction, evenly, mean_image
+from derender.evaluation.pixels import (
+    COMPONENT_IMAGES,
+    ReconstructionResult,
+    evaluate_reconstruction,
+    mean_image,
+)
 from derender.evaluation.score_table import Scores, verdict
 from derender.evaluation.truth import FactorResult, GeometryResult, evaluate_factors, evaluate_geometry
 from derender.features import Progress, embed_images, model_fingerprint
@@ -95,8 +101,8 @@ def reconstruction(
     known = (training_images or images).images
     make = partial(
         evaluate_reconstruction, optimised(model, fit_steps), images.images, mean=mean_image(known),
-        components_of=known[evenly(len(known))], untrained=untrained_twin(model, how.seed),
-        batch_size=batch_size, progress=how.progress,
+        components_of=known[evenly_spaced(len(known), COMPONENT_IMAGES)], batch_size=batch_size,
+        untrained=untrained_twin(model, how.seed), progress=how.progress,
     )  # fmt: skip
     inputs = {"images": images.images, "fitted": known, "seed": how.seed, "steps": fit_steps or 0}
     result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, how)

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from derender.data import read_masks
+from derender.data.source import evenly_spaced
 from derender.evaluation import segmenters
 from derender.evaluation.bootstrap import ScoredRow, once_and_resampled, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
-from derender.evaluation.pixels import evenly
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, scored_table, verdict_table
 from derender.evaluation.segmenters import TEST_FRACTION, SegmentationData, SegmentSettings, divide
 from derender.features import model_fingerprint
@@ -168,7 +168,7 @@ def segment(
     check_size(model, data.images)
     settings = settings or SegmentSettings()
     settings = settings.model_copy(update={"batch_size": settings.batch_for(len(data.train))})
-    shown = data.test[evenly(len(data.test), SHOWN)]
+    shown = data.test[evenly_spaced(len(data.test), SHOWN)]
     content = content_hash({name: getattr(data, name) for name in ("images", "masks", "train", "test")})
     same = {"data": content, "classes": len(data.classes)}
     each = settings.epochs * len(data.train)

@@ -25,7 +25,8 @@ from torch.nn.functional import cross_entropy
 
 from derender.baselines.controls import flat_pixels
 from derender.data import ImageSet, split_indices
-from derender.evaluation.pixels import component_count, evenly
+from derender.data.source import evenly_spaced
+from derender.evaluation.pixels import COMPONENT_IMAGES, component_count
 from derender.features import chosen, map_batches
 from derender.features.extract import as_batch
 from derender.networks.encoders import UNetDecoder, UNetEncoder
@@ -306,7 +307,7 @@ def by_components(data: SegmentationData) -> np.ndarray:
         codes = [pca.transform(flat_pixels(data.images[part])) for part in parts]
         return np.column_stack((np.ones(len(rows)), np.concatenate(codes)))
 
-    fitted = flat_pixels(data.images[data.train[evenly(len(data.train))]])
+    fitted = flat_pixels(data.images[data.train[evenly_spaced(len(data.train), COMPONENT_IMAGES)]])
     pca = PCA(component_count(len(data.train)), random_state=0).fit(fitted)
     learned = data.masks[data.train].reshape(len(data.train), -1)
     solver, tested = np.linalg.pinv(described(data.train)), described(data.test)

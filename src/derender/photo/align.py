@@ -7,7 +7,7 @@ stopped run continues after the last photograph that it finished. Leaves out fin
 
 import csv
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from io import StringIO
 from math import cos, radians, sin
@@ -189,11 +189,13 @@ class _Cutter:
             if not row["rejected"]:
                 accepted += 1
                 row["file"] = self._write(pixels, frame, name, accepted)
-            yield row | _place(face, frame, self.size)
+            yield row | _box(face) | _place(frame, self.size)
         if not accepted:
             middle = Frame.centred(pixels.shape[1], pixels.shape[0])
-            kept = {"file": self._write(pixels, middle, name, 1)} if self.keep else {}
-            yield {"photo": name, "rejected": NO_FACE, **kept}
+            row = {"photo": name, "rejected": NO_FACE}
+            if self.keep:
+                row |= {"file": self._write(pixels, middle, name, 1), **_place(middle, self.size)}
+            yield row
 
     def _write(self, pixels: np.ndarray, frame: Frame, photo: str, number: int) -> str:
         """Write a part of a photograph as the face of that number; the name of its file."""
@@ -224,13 +226,20 @@ class _Cutter:
         return f"the model reconstructs it worse than {percentile:.0f} % of the images it was validated on"
 
 
-def _place(face: Face, frame: Frame, size: int) -> dict[str, float]:
-    """Box, frame and transform: photograph = (xx u + xy v + x0, yx u + yy v + y0) for crop pixels (u, v)."""
+def _box(face: Face) -> dict[str, Any]:
+    return _rounded(COLUMNS[3:8], (face.confidence, *face.box))
+
+
+def _place(frame: Frame, size: int) -> dict[str, Any]:
+    """Frame and transform: photograph = (xx u + xy v + x0, yx u + yy v + y0) for crop pixels (u, v)."""
     scale, angle = frame.side / size, radians(frame.roll_deg)
     c, s = scale * cos(angle), scale * sin(angle)
     x0, y0 = frame.corners()[0]
-    values = (face.confidence, *face.box, frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0)
-    return {name: round(float(value), 4) for name, value in zip(COLUMNS[3:], values, strict=True)}
+    return _rounded(COLUMNS[8:], (frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0))
+
+
+def _rounded(names: Sequence[str], values: Sequence[float]) -> dict[str, Any]:
+    return {name: round(float(value), 4) for name, value in zip(names, values, strict=True)}
 
 
 def _known(model: Derenderer | str | Path | None) -> tuple[Template, Derenderer | None, HeldOutErrors | None]:

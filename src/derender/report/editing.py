@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from PIL import Image
@@ -36,6 +36,19 @@ ROWS = ".sheet"
 """Folder of the rows of a sheet, a file for each image, until the sheet is drawn."""
 NAMED = 5
 """So many images that cannot be read are named."""
+
+
+class Edited(Protocol):
+    """What can be written for one image."""
+
+    @property
+    def row(self) -> Mapping[str, Image.Image]:
+        """Its row of a sheet over all images; empty for none."""
+        ...
+
+    def write(self, folder: Path, record: dict[str, Any], /) -> dict[str, Any]:
+        """Write its files to ``folder``; returns the record with what was written."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -97,7 +110,7 @@ class WrittenImages:
 
 
 def write_images(
-    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Any], *,
+    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
     force: bool = False, sheet: bool | None = None, beside: Sequence[OpenedImage] = (),
     resume: bool = False, video: VideoEdit | None = None, progress: Callable[..., object],
 ) -> WrittenImages:  # fmt: skip
@@ -107,8 +120,7 @@ def write_images(
         opener: a model and how images are read and drawn.
         paths: image files, videos, and folders of them.
         out: folder of the folders.
-        edit: makes of an opened image what is written. Its ``row`` has the cells of a sheet over all images.
-            Its ``write`` takes a folder and a record, and returns the record with what was written.
+        edit: makes of an opened image what is written.
         force: replace what is there, and draw images that do not suit the model.
         sheet: also draw a row for every image as sheet.png; by default for two images or more. With
             ``resume`` it shows those of the interrupted run, too; none is drawn where a row is missing.
@@ -199,7 +211,7 @@ def write_images(
 
 
 def write_image_file(
-    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Any], *,
+    opener: ImageOpener, paths: Sequence[Path], out: Path, edit: Callable[[OpenedImage], Edited], *,
     force: bool = False, resume: bool = False, **how: Any,
 ) -> WrittenImages:  # fmt: skip
     """Edit one image, and write a single file of that: the last still, a film, a panel or a mesh.

@@ -63,13 +63,7 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
         "charts": loss_charts(metrics),
         "samples": samples,
         "evidence": evidence,
-        "seen": metrics[-1]["images"] if metrics else 0,
-        "planned": getattr(config, "images", 0),
-        "saved": run.model.exists(),
-        "not_finite": sum(
-            any(isinstance(v, float) and not isfinite(v) for v in row.values()) for row in metrics
-        ),
-        "unread": unread,
+        "failures": [*_failures(run, config, metrics), *unread],
         "settings": settings,
         "environment": environment,
     }
@@ -109,6 +103,19 @@ def _facts(metrics: Metrics, config: Any) -> dict[str, str]:
         best = min(validated, key=lambda row: row["loss"])
         facts["weights of the model"] = f"after {best['images']:,} images, the best on held-out ones"
     return facts
+
+
+def _failures(run: RunFolder, config: Any, metrics: Metrics) -> list[str]:
+    """Sentences on everything that was cut short or is no number."""
+    lines = []
+    seen, planned = (metrics[-1]["images"] if metrics else 0), getattr(config, "images", 0)
+    if seen < planned:
+        why = "the run was stopped (time limit, patience, watcher or Ctrl-C), or is running."
+        lines.append(f"{seen:,} of {planned:,} planned images were seen: {why}")
+    if not run.model.exists():
+        lines.append("There is no saved model: no validation was reached.")
+    rows = sum(1 for row in metrics if any(isinstance(v, float) and not isfinite(v) for v in row.values()))
+    return [*lines, f"{rows:,} logged rows hold NaN or infinity."] if rows else lines
 
 
 def _samples(run: RunFolder) -> tuple[list[tuple[bytes, str]], list[str]]:

@@ -239,11 +239,6 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
     return [f"{key}={json.dumps(value)}" for key, value in settings_by_name(tree).items()]
 
 
-def setting_names(kind: type[Settings] = TrainConfig) -> list[str]:
-    """Every setting by its dotted name."""
-    return list(settings_by_name(kind().model_dump(mode="json")))
-
-
 def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
     """Stored settings without those of ``REMOVED``; a value this version cannot honour is a ValueError."""
     for key, neutral in REMOVED.items():

@@ -15,7 +15,8 @@ import yaml
 from hypothesis import strategies as st
 from PIL import Image
 
-from derender.training.config import setting_names
+from derender.overrides import settings_by_name
+from derender.training.config import TrainConfig
 
 
 def mutated(wholes: list[bytes], number: int) -> bytes:
@@ -126,7 +127,7 @@ def json_text(whole: Any) -> st.SearchStrategy[str]:
 
 def overrides() -> st.SearchStrategy[list[str]]:
     """Settings as ``--set`` takes them; three names of four are known, half of the values small."""
-    known = st.sampled_from(setting_names())
+    known = st.sampled_from(list(settings_by_name(TrainConfig().model_dump(mode="json"))))
     parts = st.sampled_from(["model", "objective", "optimiser", "", ".", "a.b.c", "betas.0"])
     small = st.sampled_from(["0", "1", "2", "0.5", "1e-4", "true", "none", "light", "[0.8, 0.1, 0.1]"])
     tree = PLAIN.map(lambda one: yaml.safe_dump(one, default_flow_style=True, width=10**6).strip())
