@@ -8,7 +8,6 @@ from tests.cli.conftest import settings
 
 import derender
 from derender.cli import main
-from derender.data import read_images
 from derender.data.synthetic import faces
 from derender.storage.places import model_folder
 from derender.training.held_out_errors import read_errors
@@ -49,23 +48,6 @@ def test_a_whitened_copy_has_other_features_and_the_same_scenes(folder, tmp_path
     assert torch.equal(one.decompose(image).depth, two.decompose(image).depth)
     assert read_errors(tmp_path / "mine") == read_errors(model_folder(KNOWN)) is not None
     assert not torch.equal(one.embed(image)["albedo"], two.embed(image)["albedo"])
-
-
-def test_mean_only_moves_features_to_a_mean_of_zero_and_no_distance(folder, tmp_path, capsys):
-    words = ("--limit", "24", "--mean-only")
-    assert run("whiten", folder, tmp_path / "mine", words=words) == 0
-    one, two = (derender.load(name) for name in (KNOWN, tmp_path / "mine"))
-    one, two = (net.with_features(net.features.with_steps(0)) for net in (one, two))
-    images = torch.from_numpy(read_images(folder, 64, limit=24).images).float() / 255
-    before, after = (net.features_from(net.activations(images))["albedo"][:, :192] for net in (one, two))
-    assert before.mean(dim=0).norm() > 0.05 * before.std(dim=0).norm()
-    assert after.mean(dim=0).norm() < 1e-4 * before.norm(dim=1).mean()
-    torch.testing.assert_close(torch.cdist(after, after), torch.cdist(before, before), atol=1e-2, rtol=1e-3)
-    assert run("whiten", folder, tmp_path / "other", "views=2", words=words) == 2
-    assert "leave out settings" in capsys.readouterr().err
-    two.without_features().save(tmp_path / "codes")
-    assert run("whiten", folder, tmp_path / "x", words=words, model=tmp_path / "codes") == 2
-    assert "not whitened" in capsys.readouterr().err
 
 
 def test_features_hold_fitted_scenes_where_steps_are_set(folder, tmp_path, capsys):

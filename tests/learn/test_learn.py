@@ -60,9 +60,7 @@ def test_a_copy_is_made_of_a_model_or_of_its_place(run, images, tmp_path):
     with pytest.raises(FileExistsError, match="overwrite=True"):
         derender.whiten(run, images, out=tmp_path / "one")
     with pytest.raises(FileExistsError, match="its files would be lost"):  # neither a run nor photographs
-        derender.whiten(run, images, out=run, mean_only=True, overwrite=True)
-    with pytest.raises(ValueError, match="leave out settings"):
-        derender.whiten(run, images, out=tmp_path / "three", settings=changes, mean_only=True)
+        derender.whiten(run, images, out=run, overwrite=True)
 
 
 def test_settings_are_resolved_in_one_order(tmp_path):

@@ -14,7 +14,8 @@ from derender.postprocess.embedding import HISTOGRAMS
 from derender.postprocess.fitting import Fitting, FittingSettings, MorphableMaps, coordinates_of
 from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings, with_changes
-from derender.training.features import BATCH_SIZE, fit_whitening, make_features, make_fitting, photographs
+from derender.training.features import fit_whitening, make_features, make_fitting
+from derender.training.views import BATCH_SIZE, photographs
 
 SETTINGS = WhiteningSettings(pictures=80, views=2, directions=16, spatial=False)
 CODES_OF_VECTORS = SETTINGS.model_copy(update={"vectors": False})
@@ -207,3 +208,27 @@ def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tm
     assert [one.shape for one in maps] == [(6, 4, 4), (6, 64, 64)] and all(one.amax() > 0 for one in maps)
     codes = settings.model_copy(update={"spatial": False})
     assert whitened(plain, images[:24], codes).whitening.canonical == set()
+
+
+def test_features_of_framed_images_are_kept_with_the_model(plain, images, tmp_path, monkeypatch):
+    monkeypatch.setattr("derender.training.framing.BATCH", 16)
+    monkeypatch.setattr("derender.postprocess.framing.DOUBT", 0.0)  # every image is moved
+    settings = WhiteningSettings(pictures=24, views=2, directions=8, photographs=True, canonical=True)
+    settings = settings.model_copy(update={"framing": 32, "gradients": True})
+    model, pixels = whitened(plain, images[:24], settings), images[:4].float() / 255
+    framed = model.whitening.framing(pixels)
+    assert not torch.allclose(framed, pixels, atol=0.05) and model.whitening.moved == {"geometry", "albedo"}
+    activations = model.activations(pixels)
+    for name, code in plain.encode(pixels).items():
+        torch.testing.assert_close(model.codes(activations)[name], code)
+    own = plain.factor_activations("albedo", framed, gradients=True)
+    taken = model.whitening.inputs("albedo", activations["albedo"])
+    mirrored = plain.factor_activations("albedo", framed.flip(-1), gradients=True)
+    torch.testing.assert_close(taken, (own + mirrored) / 2, rtol=1e-3, atol=1e-4)
+    again = derender.load(model.save(tmp_path / "model"))
+    kept = whitened(again, images[:24], settings)
+    for name, value in model.embed(pixels).items():
+        torch.testing.assert_close(again.embed(pixels)[name], value)
+        torch.testing.assert_close(kept.embed(pixels)[name], value)
+    maps = [saliency(method, model, pixels, "albedo") for method in ("grad-cam", "pixels")]
+    assert [one.shape for one in maps] == [(4, 4, 4), (4, 64, 64)] and all(one.amax() > 0 for one in maps)

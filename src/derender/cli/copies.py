@@ -7,10 +7,8 @@ from typing import Any
 from typer import Exit
 
 from derender.cli.console import notice, progress_bar, refuse_existing, report_images
-from derender.cli.options import OutModel, Output, PartOfImages, Seed, Settings, TrainedModel, command, option
+from derender.cli.options import OutModel, Output, PartOfImages, Seed, Settings, TrainedModel, command
 from derender.cli.runs import DryRun, dry_run_shown
-
-MEAN_ONLY = "Keep the model's own directions; take only the mean of its features from these images."
 
 
 def copied(
@@ -37,7 +35,7 @@ def copied(
 @command("whiten", "whiten photos/ --model rendered-faces-64 --out mine")
 def whiten(
     images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Settings = None,
-    mean_only: bool = option(False, MEAN_ONLY, "--mean-only"), seed: Seed = 0, dry_run: DryRun = False,
+    seed: Seed = 0, dry_run: DryRun = False,
 ) -> None:  # fmt: skip
     """Write a copy of a model whose features move as little as possible with other factors.
 
@@ -47,8 +45,7 @@ def whiten(
     """
     from derender import learn
 
-    how = {"mean_only": mean_only, "seed": seed}
-    scores = copied(learn.whiten, "re-rendering", images, model, out, output, settings, dry_run, **how)
+    scores = copied(learn.whiten, "re-rendering", images, model, out, output, settings, dry_run, seed=seed)
     for name, ratios in scores["between_over_within"].items():
         clear = sum(ratio > 1 for ratio in ratios)
         differ = f"in {clear} images differ more than one does where other factors change"

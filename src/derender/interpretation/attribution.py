@@ -31,6 +31,7 @@ from derender.baselines.controls import untrained_twin
 from derender.evaluation.pixels import masked_ssim
 from derender.interpretation.probe import Probe
 from derender.render import warp
+from derender.scene.crop import back, crop_images
 from derender.storage.places import optional, require_known
 
 OUTPUTS = ("logit", "probability")
@@ -117,10 +118,16 @@ def saliency(
     maps = (gradient * features).sum(dim=1)
     own, mirror = maps[: len(images)], maps[len(images) :]
     maps = (own + mirror.flip(-1) if len(mirror) else own).relu()
-    if not model.features.turns(factor):
+    framing, turned = model.features.framing(factor), model.features.turns(factor)
+    if framing is None and not turned:
         return maps
-    depth, camera = model.surface(images)  # back from the canonical view
-    shown = warp(upsampled(maps, depth.shape[-1])[:, None], depth, camera, model.fov_deg).image
+    shown = upsampled(maps, images.shape[-1])[:, None]
+    framed = images if framing is None else framing(images)
+    if turned:  # back from the canonical view
+        depth, camera = model.surface(framed)
+        shown = warp(shown, depth, camera, model.fov_deg).image
+    if framing is not None:  # back from the crop
+        shown = crop_images(shown, back(framing.crops(images)), torch.zeros_like(shown))
     return adaptive_avg_pool2d(shown, maps.shape[-1])[:, 0]
 
 

@@ -16,7 +16,7 @@ from derender.storage.places import model_folder
 from derender.training.config import FeatureSettings, with_changes
 from derender.training.distillation import RefineConfig
 from derender.training.distillation import refine as distil
-from derender.training.features import make_features, recentre
+from derender.training.features import make_features
 from derender.training.held_out_errors import read_errors, store_errors, write_errors
 from derender.training.unets import UNetSettings, distil_unets
 
@@ -44,7 +44,7 @@ def copy_settings(command: str, settings: Changes = ()) -> Any:
 
 def whiten(
     model: Derenderer | str | Path, images: ImageSet | str | Path, *, out: str | Path,
-    settings: Changes = (), mean_only: bool = False, seed: int = 0, **how: Any,
+    settings: Changes = (), seed: int = 0, **how: Any,
 ) -> ModelCopy:  # fmt: skip
     """A copy of a model whose features move as little as possible with other factors.
 
@@ -56,7 +56,6 @@ def whiten(
         images: an image set at the model's size, or its address.
         out: folder of the copy.
         settings: changes of `FeatureSettings`, as ``{"whitening.pictures": 8000}``.
-        mean_only: keep the model's own directions; estimate only the mean of its features.
         seed: of the random subset of images and of the renderings.
         how: ``part``, ``dataset``, ``limit``, ``device``, ``overwrite``, ``on_images`` and ``progress``.
 
@@ -66,14 +65,8 @@ def whiten(
     features = copy_settings("whiten", settings)
     if features.whitening.pictures < 2:
         raise ValueError("whitening needs 2 images or more: set whitening.pictures=2000")
-    if mean_only and settings:
-        raise ValueError("with mean_only nothing else is estimated: leave out settings")
     work = _Copying(model, images, Path(out), 2, **how)
-    if mean_only:
-        whitening = recentre(work.model, work.pixels, progress=work.progress)
-        made = work.model.with_features(replace(work.model.features, whitening=whitening))
-    else:
-        made = make_features(work.model, work.pixels, features, seed=seed, progress=work.progress)
+    made = make_features(work.model, work.pixels, features, seed=seed, progress=work.progress)
     assert made.whitening is not None
     ratios = {name: made.whitening.get_buffer(f"{name}_ratios").tolist() for name in made.whitening.names}
     return work.saved(made, {"between_over_within": ratios}, same_errors=True)

@@ -22,6 +22,7 @@ from derender.data import GivenImages, as_batch, check_images
 from derender.networks import Factor
 from derender.networks.encoders import reduced
 from derender.postprocess.fitting import STEPS, Fitted, Fitting, coordinates_of
+from derender.postprocess.framing import Framing
 from derender.postprocess.whitening import Whitening
 from derender.presets import ModelSettings
 from derender.render import Rendering, unwarp
@@ -62,6 +63,11 @@ class Features:
     def turns(self, factor: str) -> bool:
         """Whether a factor's feature is made of the image's canonical view."""
         return self.whitening is not None and factor in self.whitening.canonical
+
+    def framing(self, factor: str) -> Framing | None:
+        """What finds the crops that a factor's feature is made of, if it is."""
+        whitening = self.whitening
+        return whitening.framing if whitening is not None and factor in whitening.mirrored else None
 
     def __call__(
         self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]
@@ -203,12 +209,16 @@ class EmbeddingModel(nn.Module):
     ) -> Float[Tensor, "n _"]:
         """``activations`` for one factor, without coordinates.
 
-        Where ``features`` take the canonical view, its activations follow the code. ``gradients``: followed
-        by `gradient_directions` and `gradient_histograms`; by default where ``features`` take them.
+        Where ``features`` take another crop or the canonical view, its activations follow the code.
+        ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default where
+        ``features`` take them.
         """
-        net, turned, parts = dict[str, Any](self.nets)[name], self.features.turns(name), list[Tensor]()
-        shown = reduced(self.canonical_view(images) if turned else images, self.settings.network)
-        code = [net.encoder(images)] if turned else []
+        net, parts = dict[str, Any](self.nets)[name], list[Tensor]()
+        framing = self.features.framing(name)
+        shown = images if framing is None else framing(images)
+        shown = self.canonical_view(shown) if self.features.turns(name) else shown
+        code = [] if shown is images else [net.encoder(images)]
+        shown = reduced(shown, self.settings.network)
         for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
             parts += [*code, activated := net.activations(one)]
             if self.whitening is not None and name in self.whitening.names and gradients is None:

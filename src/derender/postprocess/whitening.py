@@ -13,10 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from derender.postprocess.framing import Framing
 from derender.storage.tensors import read_tensors, write_tensors
 
 _MIRRORED = "reads_mirror_image"  # in a file: maps take images with their mirror images
 _CANONICAL = "_canonical"  # after a factor's name: its map takes the canonical view's activations
+_FRAMING = "framing."  # before the names of the framing network's tensors
 _ALONE = "_alone"  # after a factor's name, beside the former: this one takes images alone
 _NEVER_SINGULAR = 1e-9  # share of the mean variance that is added at least: Cholesky's root must exist
 _TINY = torch.finfo(torch.float32).tiny
@@ -132,17 +134,19 @@ class Whitening(nn.Module):
 
     A projection takes the first of the activations, as many as it has rows. Those of names in ``canonical``
     take the last, of the image's canonical view. Those of names in ``mirrored`` take the mean over an image
-    and its mirror image, whose activations follow.
+    and its mirror image, whose activations follow. With a ``framing`` these take the last, of the image in
+    its crop.
     """
 
     def __init__(
         self, projections: Mapping[str, Projection], *, mirrored: Collection[str] = (),
-        canonical: Collection[str] = (),
+        canonical: Collection[str] = (), framing: Framing | None = None,
     ):  # fmt: skip
         super().__init__()
         self.names = tuple(projections)
         self.mirrored = frozenset(mirrored) & frozenset(projections)
         self.canonical = frozenset(canonical) & frozenset(projections)
+        self.framing = framing
         tensors = {_MIRRORED: torch.ones(1)} if self.mirrored else {}
         tensors |= {f"{name}{_CANONICAL}": torch.ones(1) for name in self.canonical}
         for name, own in projections.items():
@@ -151,6 +155,11 @@ class Whitening(nn.Module):
             tensors |= {f"{name}_{part}": value for part, value in vars(own).items()}
         for name, value in tensors.items():
             self.register_buffer(name, value, persistent=False)
+
+    @property
+    def moved(self) -> frozenset[str]:
+        """Names whose features are made of the image in another crop or view."""
+        return self.canonical | (self.mirrored if self.framing is not None else frozenset())
 
     def forward(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n _"]]:
         return {
@@ -175,14 +184,7 @@ class Whitening(nn.Module):
             )
         if mirrored:
             activations = activations.unflatten(1, (2, -1)).mean(dim=1)
-        return (activations[:, -size:] if name in self.canonical else activations[:, :size]).float()
-
-    def with_means(self, means: Mapping[str, Float[Tensor, " input"]]) -> "Whitening":
-        """The same maps about other means of ``inputs``, by name; distances stay as they are."""
-        maps, ratios = ([self.get_buffer(f"{n}_{part}") for n in self.names] for part in ("map", "ratios"))
-        rows = zip(self.names, maps, ratios, strict=True)
-        projections = {name: Projection(means[name].float(), own, ratio) for name, own, ratio in rows}
-        return Whitening(projections, mirrored=self.mirrored, canonical=self.canonical)
+        return (activations[:, -size:] if name in self.moved else activations[:, :size]).float()
 
     def save(self, file: Path) -> None:
         """Write the projections; complete or not at all."""
@@ -209,4 +211,6 @@ class Whitening(nn.Module):
             projections[name] = Projection(mean, chart, ratios)
         alone = {name for name in projections if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
         canonical = {name for name in projections if f"{name}{_CANONICAL}" in tensors}
-        return cls(projections, mirrored=projections.keys() - alone, canonical=canonical)
+        own = {key.removeprefix(_FRAMING): tensors[key] for key in tensors if key.startswith(_FRAMING)}
+        framing = Framing(own) if own else None
+        return cls(projections, mirrored=projections.keys() - alone, canonical=canonical, framing=framing)

@@ -55,16 +55,40 @@ def random_crops(
     roll = uniform(-math.radians(settings.roll_deg), math.radians(settings.roll_deg))
     across, down = (uniform(-settings.shift, settings.shift) for _ in range(2))
     unchanged = torch.rand(count, generator=generator) >= share
-    cosine, sine = roll.cos() * scale, roll.sin() * scale
-    crops = torch.stack([cosine, -sine, across, sine, cosine, down], dim=1).view(-1, 2, 3)
+    crops = similarities(torch.stack([scale.log(), roll, across, down], dim=1))
     return torch.where(unchanged.view(-1, 1, 1), _IDENTITY, crops)
 
 
+def similarities(parameters: Float[Tensor, "n 4"]) -> Float[Tensor, "n 2 3"]:
+    """Crops of these logarithms of scale, rolls in radians, and places of the centre across and down."""
+    scale, roll, across, down = parameters.unbind(dim=1)
+    cosine, sine = roll.cos() * scale.exp(), roll.sin() * scale.exp()
+    return torch.stack([cosine, -sine, across, sine, cosine, down], dim=1).view(-1, 2, 3)
+
+
+def parameters_of(crops: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 4"]:
+    """What `similarities` makes these crops of."""
+    cosine, sine = crops[:, 0, 0], crops[:, 1, 0]
+    return torch.stack([torch.hypot(cosine, sine).log(), torch.atan2(sine, cosine), *crops[:, :, 2].T], dim=1)
+
+
+def within(inner: Float[Tensor, "n 2 3"], outer: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+    """Crops of crops: where the inner ones lie in the image that the outer ones are cut from."""
+    turned = outer[:, :, :2] @ inner
+    return torch.cat([turned[:, :, :2], turned[:, :, 2:] + outer[:, :, 2:]], dim=2)
+
+
+def back(crops: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+    """Where the image's points lie in each crop: a crop of a crop by this is the image."""
+    turned = torch.linalg.inv(crops[:, :, :2])
+    return torch.cat([turned, -turned @ crops[:, :, 2:]], dim=2)
+
+
 def crop_images(
-    images: Float[Tensor, "n 3 h w"],
+    images: Float[Tensor, "n c h w"],
     crops: Float[Tensor, "n 2 3"],
-    surroundings: Float[Tensor, "n 3 h w"] | None = None,
-) -> Float[Tensor, "n 3 h w"]:
+    surroundings: Float[Tensor, "n c h w"] | None = None,
+) -> Float[Tensor, "n c h w"]:
     """Each image in its crop, bilinear; the identity crop returns the image bit for bit.
 
     A crop that reaches beyond its image shows ``surroundings`` there, by default the image's reflection.
@@ -94,8 +118,8 @@ def crop_scene(scene: Scene, crops: Float[Tensor, "n 2 3"], fov_deg: float) -> S
     """
     width = scene.depth.shape[-1]
     crops, focal = crops.to(scene.camera), focal_px(width, fov_deg) * 2 / width
-    cosine, sine = crops[:, 0, 0], crops[:, 1, 0]
-    scale, roll = torch.hypot(cosine, sine), torch.atan2(sine, cosine)
+    (logarithm, roll), (cosine, sine) = parameters_of(crops)[:, :2].T, crops[:, :, 0].T
+    scale = logarithm.exp()
     distance = 1 + scene.camera[:, 5]
     x, y = (scene.camera[:, 3:5] - crops[:, :, 2] * distance[:, None] / focal).unbind(dim=1)
     pitch, yaw, rolled = scene.camera[:, :3].unbind(dim=1)

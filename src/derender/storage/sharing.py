@@ -153,7 +153,7 @@ def _errors_in_words(errors: str) -> str:
 KINDS = ("bytes", "float16")
 """How the large maps of whitening and fitting are kept; weights are kept in float16 by both."""
 
-_LARGE = re.compile(r"\w+_map|maps\.\w+_axes")
+_LARGE = re.compile(r"\w+_map|maps\.\w+_axes|framing\.weight\d")
 
 
 @dataclass(frozen=True)

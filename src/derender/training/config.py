@@ -75,6 +75,7 @@ class WhiteningSettings(Settings):
     shrinkage: float = Field(default=0.1, ge=0)  # share of the mean variance added to every direction's
     photographs: bool = False  # geometry, albedo: views keep the image's own pixels, in light from any side
     canonical: bool = False  # geometry: of the image turned into the canonical view
+    framing: int = Field(default=0, ge=0)  # geometry, albedo: crops by which framing is learned; 0: none
     gradients: bool = False  # albedo: with directions and histograms of the image's gradients
     evenness: float = Field(default=0.5, ge=0, le=1)  # 0: the most discriminative directions count most
     vectors: bool = True  # light and camera have features of their own; else those are their codes

@@ -2,45 +2,38 @@
 
 Whitening: how other factors move a model's activations, measured on its own renderings. For geometry and
 albedo every image is decomposed, rendered with other values of all its vector factors (light and camera), and
-encoded again, several times. Geometry is encoded from the canonical view where the settings say so. Mirror
-images count as views, too, for the object is symmetric. For each vector factor everything but that factor is
-changed: maps are another image's. Leaves out changing one map beside the other, which brought nothing
-(lab/log.md). Brightness: the prior that shares it between albedo and light.
+encoded again, several times. Where the settings say so, images are framed as training images are, but for
+the errors of framing. Geometry is then encoded from the canonical view. Mirror images count as views, too,
+for the object is symmetric. For each vector factor everything but that factor is changed: maps are another
+image's. Leaves out changing one map beside the other, which brought nothing (lab/log.md). Brightness: the
+prior that shares it between albedo and light.
 Fitting: a morphable model of the predicted depths and albedos, within which postprocess/fitting.py optimises.
 """
 
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int64, Shaped
+from jaxtyping import Float, Shaped
 from torch import Generator, Tensor
 
-from derender.data import Progress, as_float
+from derender.data import Progress
 from derender.model import Derenderer
-from derender.networks import Factor
 from derender.postprocess import Features
 from derender.postprocess.embedding import HISTOGRAMS
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings, MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
-from derender.render import unwarp, warp
-from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior, brightness_cues
-from derender.scene.light import lambert_shading
-from derender.scene.normals import normals_from_depth
-from derender.scene.perturb import PerturbSettings, perturb_camera
+from derender.scene.crop import crop_images, similarities
+from derender.scene.perturb import PerturbSettings
 from derender.training.config import FeatureSettings, WhiteningSettings
+from derender.training.framing import fit_framing
 from derender.training.process import evaluating
-from derender.training.step import fill_uncovered
+from derender.training.views import batches, photographs, renderings
 
-BATCH_SIZE = 128
 BRIGHTNESS_IMAGES = 8000
-LIGHT_DEG = (60.0, 80.0)  # of photographs: how far pitch and yaw of their light go
-TURNS = PerturbSettings(camera_pitch_deg=6, camera_yaw_deg=12)  # of photographs
-GREY = 0.4  # share of photographs without colour
 TURNED_SHARE = 0.5  # of its variance, kept by geometry of the canonical view: its camera errs in strong light
-DARKEST = 0.1  # shading by which an image is divided, at least
+FRAMING_ERRORS = (0.02, 0.02, 0.015, 0.01)  # of a framed image: logarithm of scale, roll (radians), place
 LENGTH_IMAGES = 256  # that are fitted to measure the length of fitted coordinates, where features hold them
 
 
@@ -80,7 +73,7 @@ def fit_brightness(model: Derenderer, images: Shaped[Tensor, "n 3 h w"]) -> Brig
     if len(images) < 4 or moves or {"light", "albedo"} - {factor.parameter for factor in model.factors}:
         return None
     with evaluating(model):
-        for _, batch in _batches(model, images, torch.arange(min(len(images), BRIGHTNESS_IMAGES)), None):
+        for _, batch in batches(model, images, torch.arange(min(len(images), BRIGHTNESS_IMAGES)), None):
             result.append(brightness_cues(model.decompose(batch)).cpu())
     return BrightnessPrior.of(torch.cat(result))
 
@@ -92,6 +85,8 @@ def fit_whitening(
 ) -> Whitening:  # fmt: skip
     """The map from a trained model's activations to its features; arguments as of `make_features`.
 
+    A framing network that the model has already is kept, where the settings ask for one.
+
     ``size`` is that of the features, by default the code's. Fewer than two images, or activations that are
     not finite, are a ValueError.
     """
@@ -100,6 +95,10 @@ def fit_whitening(
     rows = torch.randperm(len(images), generator=generator)[: settings.pictures]
     if not len(rows):
         raise ValueError("whitening needs at least 2 images, got 0")
+    framing = None
+    if settings.framing and settings.spatial and settings.mirrored:
+        framing = None if model.whitening is None else model.whitening.framing
+        framing = framing or fit_framing(model, images, settings.framing, seed=seed, progress=progress)
     model = model.without_features().with_brightness(None)
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
     gradients = settings.gradients and settings.spatial
@@ -108,6 +107,7 @@ def fit_whitening(
     turned = {f.name for f in maps if turns and f.parameter == "depth"}
 
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
+        batch = batch if framing is None else framing(batch)
         seen = dict.fromkeys(turned, model.canonical_view(batch)) if turned else {}
         return {
             f.name: model.factor_activations(f.name, seen.get(f.name, batch), f.name in described)
@@ -119,12 +119,14 @@ def fit_whitening(
     mirrored: dict[str, list[Scatter]] = {}
     alone: dict[str, Scatter] = {}
     with evaluating(model):
-        for start, batch in _batches(model, images, rows, progress):
+        for start, batch in batches(model, images, rows, progress):
             scene = model.decompose(batch)
             if settings.photographs and {"albedo", "depth", "light", "camera"} <= scene.parameters.keys():
                 shown = photographs(model, scene, batch, generator, settings.views)
             else:
-                shown = _renderings(model, scene, batch, vectors, perturb, generator, settings.views)
+                shown = renderings(model, scene, batch, vectors, perturb, generator, settings.views)
+            if framing is not None:
+                shown = [batch, *(crop_images(one, nearly_framed(one, generator)) for one in shown[1:])]
             views = [encode(one) for one in shown]
             if settings.mirrored:
                 views += [encode(one.flip(-1)) for one in shown]
@@ -140,7 +142,7 @@ def fit_whitening(
             exchangeable = len(batch) > 1 and settings.vectors
             for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
-                shown = _renderings(model, scene, batch, rest, perturb, others, settings.views)
+                shown = renderings(model, scene, batch, rest, perturb, others, settings.views)
                 codes = [model.nets[factor.name].encoder(one).float() for one in shown]  # type: ignore[operator]
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     size = size or model.settings.network.code_size
@@ -155,28 +157,8 @@ def fit_whitening(
     for name in turned:
         projections[name] = replace(projections[name], map=projections[name].map * TURNED_SHARE**0.5)
     mirrors = mirrored if settings.mirrored else ()
-    return Whitening(projections, mirrored=mirrors, canonical=turned).to(model.device)
-
-
-@torch.no_grad()
-def recentre(
-    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], *, progress: Progress | None = None
-) -> Whitening:
-    """The model's own whitening about the mean of these images, uint8 or float in 0..1; the model stays.
-
-    Features of another kind of images have another mean, on which a penalised or hardly trained head leans. A
-    model whose features are not whitened is a ValueError.
-    """
-    whitening = model.whitening
-    if whitening is None:
-        raise ValueError("its features are codes, which are not whitened: leave out mean_only")
-    totals = dict.fromkeys(whitening.names, torch.zeros((), dtype=torch.float64))
-    for _, batch in _batches(model, images, torch.arange(len(images)), progress):
-        for name, total in totals.items():
-            taken = whitening.inputs(name, model.factor_activations(name, batch))
-            totals[name] = total + taken.double().sum(dim=0).cpu()
-    means = {name: (total / len(images)).to(model.device) for name, total in totals.items()}
-    return whitening.with_means(means).to(model.device)
+    whitening = Whitening(projections, mirrored=mirrors, canonical=turned, framing=framing)
+    return whitening.to(model.device)
 
 
 @torch.no_grad()
@@ -196,7 +178,7 @@ def make_fitting(
     examples: dict[str, list[Tensor]] = {parameter: [] for parameter in PARAMETERS.values()}
     squares = torch.zeros((), dtype=torch.float64)
     with evaluating(model):
-        for start, batch in _batches(model, images, rows, progress):
+        for start, batch in batches(model, images, rows, progress):
             scene, features = model.decompose(batch), model.embed(batch)
             _check_finite("fitting", {name: scene.parameters[name] for name in examples}, start)
             for name, parts in examples.items() if maps is None else ():
@@ -211,7 +193,7 @@ def make_fitting(
     if settings.steps:
         able = model.with_features(Features(None, fitting))
         total, few = 0.0, rows[:LENGTH_IMAGES]
-        for _, batch in _batches(model, images, few, None):
+        for _, batch in batches(model, images, few, None):
             fitted = able.fit_scenes(batch, settings.steps).coordinates
             total += sum(float(value.double().square().sum()) for value in fitted.values())
         own = total / len(few)
@@ -220,62 +202,10 @@ def make_fitting(
     return fitting
 
 
-def _renderings(
-    model: Derenderer, scene: Scene, images: Float[Tensor, "n 3 h w"], changing: Iterable[Factor],
-    perturb: PerturbSettings, generator: Generator, count: int,
-) -> list[Float[Tensor, "n 3 h w"]]:  # fmt: skip
-    """The images, then renderings of their scenes with other values of these factors, all pixels filled."""
-    shown, ranges = [images], model.settings.ranges
-    for _ in range(count):
-        changed = {
-            factor.parameter: factor.perturb(scene.parameters[factor.parameter], generator, perturb, ranges)
-            for factor in changing
-            if factor.perturb is not None
-        }
-        rendering = model.render(scene.with_parameters(**changed))
-        shown.append(fill_uncovered(rendering.image, rendering.mask, images))
-    return shown
-
-
-def photographs(
-    model: Derenderer, scene: Scene, images: Float[Tensor, "n 3 h w"], generator: Generator, count: int
-) -> list[Float[Tensor, "n 3 h w"]]:
-    """The images, then as often in light from any side, turned a little, by another camera; all in 0..1.
-
-    The images' own pixels lie on the surfaces; each is multiplied by the new shading over its own.
-    """
-    shown, fov = [images], model.fov_deg
-    normals = normals_from_depth(scene.depth, fov)
-    texture = unwarp(images, scene.depth, scene.camera, fov)
-    texture = texture / lambert_shading(normals, scene.light).clamp(min=DARKEST)
-
-    def drawn(low: float, high: float, *shape: int) -> Tensor:
-        return (low + (high - low) * torch.rand(len(images), *shape, generator=generator)).to(images)
-
-    for _ in range(count):
-        slopes = [math.radians(end) * drawn(-1, 1) for end in LIGHT_DEG]
-        light = torch.stack([0.02 + 0.6 * drawn(0, 1).square(), drawn(0.4, 1.3), *slopes], dim=1)
-        camera = perturb_camera(scene.camera, generator, TURNS, model.settings.ranges)
-        rendering = warp(texture * lambert_shading(normals, light), scene.depth, camera, fov)
-        view = fill_uncovered(rendering.image, rendering.mask, images)
-        view = view * (drawn(0.15, 0.6) / view.mean(dim=(1, 2, 3)).clamp(min=DARKEST)).view(-1, 1, 1, 1)
-        grey = view.mean(dim=1, keepdim=True).expand_as(view)
-        view = torch.where(drawn(0, 1, 1, 1, 1) < GREY, grey, view).clamp(0, 1)
-        view = view ** drawn(-0.35, 0.35, 1, 1, 1).exp()
-        noise = torch.randn(view.shape, generator=generator).to(view) * drawn(0, 0.02, 1, 1, 1)
-        shown.append((view + noise).clamp(0, 1))
-    return shown
-
-
-def _batches(
-    model: Derenderer, images: Shaped[Tensor, "n 3 h w"], rows: Int64[Tensor, " k"], progress: Progress | None
-) -> Iterator[tuple[int, Float[Tensor, "b 3 h w"]]]:
-    """These rows of the images in batches, in 0..1 on the model's device, each with its place."""
-    for start in range(0, len(rows), BATCH_SIZE):
-        batch = images[rows[start : start + BATCH_SIZE].to(images.device)]
-        yield start, (as_float(batch) if batch.dtype == torch.uint8 else batch.float()).to(model.device)
-        if progress is not None:
-            progress(min(start + BATCH_SIZE, len(rows)), len(rows))
+def nearly_framed(images: Float[Tensor, "n 3 h w"], generator: Generator) -> Float[Tensor, "n 2 3"]:
+    """Random crops that are off by as much as a framing network errs."""
+    errors = torch.randn(len(images), 4, generator=generator).clamp(-2, 2) * torch.tensor(FRAMING_ERRORS)
+    return similarities(errors).to(images)
 
 
 def _check_finite(what: str, values: Mapping[str, Tensor], start: int) -> None:
