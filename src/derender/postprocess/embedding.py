@@ -198,25 +198,30 @@ class EmbeddingModel(nn.Module):
         `coordinates_of`.
         """
         check_images(images, self.image_size)
-        result = {factor.name: self.factor_activations(factor.name, images) for factor in self.factors}
+        framing = None if self.whitening is None else self.whitening.framing
+        framed = None if framing is None else framing(images)
+        result = {f.name: self.factor_activations(f.name, images, framed=framed) for f in self.factors}
         if self.features.fits_scenes:
             fitted = self._fitted(images, self.features.required_fitting().settings.steps).coordinates
             result |= {coordinates_of(name): value for name, value in fitted.items()}
         return result
 
     def factor_activations(
-        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None
-    ) -> Float[Tensor, "n _"]:
+        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None,
+        framed: Float[Tensor, "n 3 h w"] | None = None,
+    ) -> Float[Tensor, "n _"]:  # fmt: skip
         """``activations`` for one factor, without coordinates.
 
         Where ``features`` take another crop or the canonical view, its activations follow the code.
         ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default where
-        ``features`` take them.
+        ``features`` take them. ``framed`` are the images in their crops, if they are known.
         """
         net, parts = dict[str, Any](self.nets)[name], list[Tensor]()
-        framing = self.features.framing(name)
-        shown = images if framing is None else framing(images)
-        shown = self.canonical_view(shown) if self.features.turns(name) else shown
+        if (framing := self.features.framing(name)) is None:
+            framed = images
+        elif framed is None:
+            framed = framing(images)
+        shown = self.canonical_view(framed) if self.features.turns(name) else framed
         code = [] if shown is images else [net.encoder(images)]
         shown = reduced(shown, self.settings.network)
         for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
