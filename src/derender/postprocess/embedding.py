@@ -217,11 +217,10 @@ class EmbeddingModel(nn.Module):
         ``features`` take them. ``framed`` are the images in their crops, if they are known.
         """
         net, parts = dict[str, Any](self.nets)[name], list[Tensor]()
-        if (framing := self.features.framing(name)) is None:
-            framed = images
-        elif framed is None:
-            framed = framing(images)
-        shown = self.canonical_view(framed) if self.features.turns(name) else framed
+        framing, shown = self.features.framing(name), images
+        if framing is not None:
+            shown = framing(images) if framed is None else framed
+        shown = self.canonical_view(shown) if self.features.turns(name) else shown
         code = [] if shown is images else [net.encoder(images)]
         shown = reduced(shown, self.settings.network)
         for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
