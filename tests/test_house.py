@@ -29,14 +29,14 @@ BUDGET = {  # lines, files
     "networks": (710, 5),
     "storage": (955, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
-    "postprocess": (960, 5),  # features of the canonical view; images framed as training images are
+    "postprocess": (965, 5),  # features of the canonical view; images framed as training images are
     "scene": (885, 11),  # crops of crops
     "demo": (515, 3),  # the light of the last portrait
     "renderers": (651, 8),
     "learn": (930, 5),
 }
-TOTAL = (39_422, 243)  # on the way to (37_000, 270)
-TEST_LINES = 26_308
+TOTAL = (39_424, 243)  # on the way to (37_000, 270)
+TEST_LINES = 26_309
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

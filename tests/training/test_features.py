@@ -195,6 +195,7 @@ def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tm
     turned = plain.factor_activations("geometry", plain.canonical_view(pixels))
     assert model.whitening.canonical == {"geometry"}
     activations = model.activations(pixels)
+    assert model.activations(1.2 * pixels)["geometry"].isfinite().all(), "renderings may be too bright"
     torch.testing.assert_close(model.codes(activations)["geometry"], plain.encode(pixels)["geometry"])
     _, own, _, mirrored = activations["geometry"].split([256, turned.shape[1]] * 2, dim=1)
     torch.testing.assert_close(own, turned)
