@@ -43,7 +43,10 @@ def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any)
     changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
     for key, value in changes:
         *parents, last = _full_key(key, tree, names).split(".")
-        reduce(getitem, parents, tree)[last] = value
+        try:
+            reduce(getitem, parents, tree)[last] = value
+        except (TypeError, KeyError) as error:  # a whole group was replaced by another value before
+            raise ValueError(f"setting {key!r}: {parents[0]} was set as a whole before; name one") from error
     return checked(tree, type(config))
 
 

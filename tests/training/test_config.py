@@ -85,3 +85,10 @@ def test_settings_on_the_page_of_deviations_exist():
     page = (Path(__file__).parents[2] / "docs" / "explanation" / "deviations.md").read_text()
     named = re.findall(r"`([a-z_.]+=[a-z0-9.-]+)`", page)
     assert "geometry_start=1" in named and resolve("faces", named).whitening.pictures == 0
+
+
+@pytest.mark.parametrize("whole", ["optimiser=x", "model={}"])
+def test_a_setting_of_a_group_that_was_replaced_is_refused(whole):
+    inner = {"optimiser=x": "optimiser.weight_decay=1", "model={}": "model.network.width=8"}[whole]
+    with pytest.raises(ValueError, match="was set as a whole before"):
+        resolve("faces", [whole, inner])
