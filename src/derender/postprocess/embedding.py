@@ -220,7 +220,7 @@ class EmbeddingModel(nn.Module):
         framing, shown = self.features.framing(name), images
         if framing is not None:
             shown = framing(images) if framed is None else framed
-        shown = self._frontal(shown) if self.features.turns(name) else shown
+        shown = self.frontal(shown) if self.features.turns(name) else shown
         code = [] if shown is images else [net.encoder(images)]
         shown = reduced(shown, self.settings.network)
         for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
@@ -244,9 +244,9 @@ class EmbeddingModel(nn.Module):
 
     def canonical_view(self, images: GivenImages) -> Float[Tensor, "n 3 h w"]:
         """The images' own pixels on their surface, seen from the front (`unwarp`); images as for `embed`."""
-        return self._frontal(as_batch(images, self.image_size, next(self.parameters()).device))
+        return self.frontal(as_batch(images, self.image_size, next(self.parameters()).device))
 
-    def _frontal(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    def frontal(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
         """The canonical view of images of the model's size; renderings may exceed 1."""
         return unwarp(images, *self.surface(images), self.settings.ranges.fov_deg)
 

@@ -108,7 +108,7 @@ def fit_whitening(
 
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
         batch = batch if framing is None else framing(batch)
-        seen = dict.fromkeys(turned, model.canonical_view(batch)) if turned else {}
+        seen = dict.fromkeys(turned, model.frontal(batch)) if turned else {}
         return {
             f.name: model.factor_activations(f.name, seen.get(f.name, batch), f.name in described)
             for f in maps
@@ -126,7 +126,7 @@ def fit_whitening(
             else:
                 shown = renderings(model, scene, batch, vectors, perturb, generator, settings.views)
             if framing is not None:
-                shown = [batch, *(crop_images(one, nearly_framed(one, generator)) for one in shown[1:])]
+                shown = [batch, *(crop_images(one, _nearly_framed(one, generator)) for one in shown[1:])]
             views = [encode(one) for one in shown]
             if settings.mirrored:
                 views += [encode(one.flip(-1)) for one in shown]
@@ -202,7 +202,7 @@ def make_fitting(
     return fitting
 
 
-def nearly_framed(images: Float[Tensor, "n 3 h w"], generator: Generator) -> Float[Tensor, "n 2 3"]:
+def _nearly_framed(images: Float[Tensor, "n 3 h w"], generator: Generator) -> Float[Tensor, "n 2 3"]:
     """Random crops that are off by as much as a framing network errs."""
     errors = torch.randn(len(images), 4, generator=generator).clamp(-2, 2) * torch.tensor(FRAMING_ERRORS)
     return similarities(errors).to(images)
