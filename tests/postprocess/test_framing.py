@@ -45,11 +45,11 @@ def test_crops_of_crops_and_the_way_back():
 
 
 def test_a_network_learns_from_crops_alone(monkeypatch):
-    monkeypatch.setattr(training, "BATCH", 32)
+    monkeypatch.setattr(training, "BATCH", 16)
     monkeypatch.setattr(training, "WARMUP", 20)
     plain = derender.load("rendered-faces-64").without_features()
     images = torch.from_numpy(faces.generate(120, 64, seed=7).images)
-    framing = fit_framing(plain, images[:96], 32 * 120, seed=1)
+    framing = fit_framing(plain, images[:96], 16 * 140, seed=1)
     examples = training._examples(plain, images[96:], torch.arange(24), torch.Generator().manual_seed(1))
     shown, wanted = drawn_crops(*examples, torch.Generator().manual_seed(2))
     answers, errors = framing.answers(shown)
