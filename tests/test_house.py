@@ -17,7 +17,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (7_130, 30),
-    "evaluation": (7_267, 32),
+    "evaluation": (7_310, 32),  # ridge regression in closed form
     "report": (4_000, 25),  # images that do not suit a model are left out
     "cli": (2_291, 32),  # the same
     "training": (3_600, 20),  # CUDA graphs; networks compiled if asked; the framing network
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (651, 8),
     "learn": (930, 5),
 }
-TOTAL = (39_427, 243)  # on the way to (37_000, 270)
-TEST_LINES = 26_316
+TOTAL = (39_468, 243)  # on the way to (37_000, 270)
+TEST_LINES = 26_335
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

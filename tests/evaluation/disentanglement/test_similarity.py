@@ -2,9 +2,15 @@
 
 import numpy as np
 import pytest
+from sklearn.linear_model import RidgeCV
 
 from derender.evaluation.disentanglement import linear_cka, pearson, similarity
-from derender.evaluation.disentanglement.similarity import correlation_matrix, held_out
+from derender.evaluation.disentanglement.similarity import (
+    PENALTIES,
+    correlation_matrix,
+    fit_predict,
+    held_out,
+)
 
 
 def features(rows: int = 40, size: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
@@ -96,6 +102,17 @@ def test_a_linear_map_is_predicted_and_constant_features_predict_the_reference()
         assert rows.sum() == 40 and y[~rows].mean(axis=0) == pytest.approx(train_mean)
     constant, reference = held_out(np.ones((200, 3)), y, seed=4)
     np.testing.assert_allclose(constant, reference, rtol=1e-12)
+
+
+@pytest.mark.parametrize("width", [6, 30, 90])
+def test_ridge_regression_is_that_of_scikit_learn(width):
+    draw = np.random.default_rng(0)
+    x, x_new = draw.normal(size=(50, width)) * np.linspace(0.1, 3, width), draw.normal(size=(9, width))
+    y = x[:, :4] @ draw.normal(size=(4, 20)) + draw.normal(size=(50, 20))
+    power = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) ** 2
+    penalties = np.array(PENALTIES) * power[power > 1e-9].mean()
+    theirs = RidgeCV(penalties, alpha_per_target=True).fit(x, y).predict(x_new)
+    np.testing.assert_allclose(fit_predict(x, y, x_new), theirs, atol=1e-8)
 
 
 def test_cross_prediction_has_a_direction():

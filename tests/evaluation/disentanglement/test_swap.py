@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from derender.evaluation.disentanglement.swap import diagonal_over_rest, swap_test
+from derender.evaluation.disentanglement.swap import diagonal_over_rest, swap_test, unexchanged
 from derender.render import Rendering
 from derender.scene import Scene
 
@@ -69,6 +69,8 @@ def test_features_that_hold_everything_move_alike_whatever_is_exchanged():
     assert scores.ratio == pytest.approx(1, rel=1e-5)
     half = swap_test(Reader(0.3), pictures())
     assert 1.5 < half.ratio < 10 and (np.diag(half.moved) > half.moved.mean(axis=1)).all()
+    again = swap_test(Reader(0.3), pictures(), known=unexchanged(Reader(0.3), pictures()))
+    np.testing.assert_array_equal(again.moved, half.moved)
 
 
 def test_uncovered_pixels_show_the_edge_of_the_picture_that_was_put_in():

@@ -29,7 +29,7 @@ from derender.evaluation.disentanglement.similarity import (
     pearson,
     similarity,
 )
-from derender.evaluation.disentanglement.swap import SwapScores, swap_test
+from derender.evaluation.disentanglement.swap import Encodings, SwapScores, swap_test, unexchanged
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Cell, Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
@@ -241,6 +241,15 @@ def disentangle(
     def components() -> np.ndarray:
         return pca_features(images, components=max(len(sizes), min(64, len(images) // 4))).concatenate()
 
+    def swapped(seed: int) -> np.ndarray:
+        return np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
+
+    @cache
+    def encoded() -> tuple[np.ndarray, tuple[Encodings, Encodings]]:
+        """The images of all seeds' swap tests, and the model's encodings that these share."""
+        rows = np.unique(np.concatenate(list(map(swapped, seeds))))
+        return rows, unexchanged(model, pixels[rows], batch_size=batch_size)
+
     def made(row: str, seed: int) -> FeatureScores:
         swap, truth, net = None, None, model if row == MODEL else None
         if row == "untrained encoder":
@@ -255,8 +264,12 @@ def disentangle(
         else:
             blocks = features() if row == MODEL else shuffled_rows(features(), seed)
         if net is not None:
-            chosen = np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
-            swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size)
+            chosen, known = swapped(seed), None
+            if net is model:
+                rows, both = encoded()
+                places = np.searchsorted(rows, chosen)
+                known = tuple({key: each[places] for key, each in one.items()} for one in both)
+            swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size, known=known)
         if len(factors) >= 2:
             truth = ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
         return FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap)

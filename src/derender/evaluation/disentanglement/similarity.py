@@ -123,17 +123,29 @@ def held_out(x: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0) -> 
 def fit_predict(x: np.ndarray, y: np.ndarray, x_new: np.ndarray) -> np.ndarray:
     """Ridge with an intercept from (N, D) to (N, T), applied to (M, D): (M, T) predictions.
 
-    ``PENALTIES`` are relative to the mean squared singular value of the centred features that is not 0.
+    ``PENALTIES`` are relative to the mean squared singular value of the centred features that is not 0. Of a
+    target's own one the leave-one-out error is the smallest; only that error is computed in float32.
     """
-    from sklearn.linear_model import RidgeCV
-
-    centred = x - x.mean(axis=0)
-    power = np.linalg.eigvalsh(centred @ centred.T if x.shape[1] > len(x) else centred.T @ centred)
+    mean, centre = y.mean(axis=0), x.mean(axis=0)
+    apart, centred = y - mean, x - centre
+    wide = x.shape[1] > len(x)
+    power, vectors = np.linalg.eigh(centred @ centred.T if wide else centred.T @ centred)
     alive = power > 1e-11 * max(power[-1], 1e-300)
     if not alive.any():
-        return np.tile(y.mean(axis=0), (len(x_new), 1))
-    ridge = RidgeCV(np.array(PENALTIES) * power[alive].mean(), alpha_per_target=True)
-    return ridge.fit(x, y).predict(x_new).reshape(len(x_new), -1)
+        return np.tile(mean, (len(x_new), 1))
+    power, vectors = power[alive], vectors[:, alive]
+    left = vectors if wide else centred @ vectors / np.sqrt(power)
+    along = left.T @ apart
+    penalties = np.array(PENALTIES)[:, None] * power.mean()
+    shrunk = penalties / (power + penalties)  # (penalties, directions): shares of ``along`` that are left
+    unseen = np.maximum(1 - 1 / len(x) - np.square(left).sum(axis=1), 0) + shrunk @ np.square(left).T
+    rest, rows, parts = (each.astype(np.float32) for each in (apart - left @ along, left, along))
+    errors = [
+        np.square((rest + (rows * each) @ parts) / own[:, None]).sum(axis=0)
+        for each, own in zip(shrunk.astype(np.float32), unseen.astype(np.float32), strict=True)
+    ]
+    kept = 1 - shrunk[np.argmin(errors, axis=0)].T
+    return mean + ((x_new - centre) @ centred.T) @ (left @ (kept * along / power[:, None]))
 
 
 def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

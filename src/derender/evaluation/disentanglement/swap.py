@@ -75,18 +75,29 @@ def encodings(
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 
-def swap_test(model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64) -> SwapScores:
-    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors."""
+def unexchanged(model: Any, images: np.ndarray, *, batch_size: int = 64) -> tuple[Encodings, Encodings]:
+    """Of (N, 3, H, W) uint8 images and of their renderings: what `swap_test` needs whoever the donors are."""
+    inputs = encodings(model, images, batch_size=batch_size)
+    return inputs, encodings(model, images, _decoded(inputs), batch_size=batch_size)
+
+
+def swap_test(
+    model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64,
+    known: Sequence[Encodings] | None = None,
+) -> SwapScores:  # fmt: skip
+    """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors.
+
+    ``known`` is what `unexchanged` gives of these images; by default it is computed.
+    """
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")
     names, count = [factor.name for factor in model.factors], len(images)
     parameters = [factor.parameter for factor in model.factors]
     donor = derangement(count, torch.Generator().manual_seed(seed))
-    inputs = encodings(model, images, batch_size=batch_size)
-    stored = (key for key in inputs if key.startswith("parameter "))
-    scene = Scene.from_parameters({key.removeprefix("parameter "): inputs[key] for key in stored})
+    inputs, plain = known or unexchanged(model, images, batch_size=batch_size)
+    scene = _decoded(inputs)
     exchanged = [scene.with_parameters(**{name: scene.parameters[name][donor]}) for name in parameters]
-    plain, *swapped = (encodings(model, images, one, batch_size=batch_size) for one in (scene, *exchanged))
+    swapped = [encodings(model, images, one, batch_size=batch_size) for one in exchanged]
     donors = {key: each[donor] for key, each in plain.items()}
     apart = _distances(plain, donors)
     unit = {key: each.mean() or np.nan for key, each in apart.items()}
@@ -116,6 +127,11 @@ def swap_test(model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int 
         count,
         np.stack([drawn, drawn_decoded], axis=1),
     )
+
+
+def _decoded(inputs: Encodings) -> Scene:
+    stored = (key for key in inputs if key.startswith("parameter "))
+    return Scene.from_parameters({key.removeprefix("parameter "): inputs[key] for key in stored})
 
 
 def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
