@@ -7,6 +7,7 @@ from torch.nn.functional import interpolate
 import derender
 from derender.data.synthetic import faces
 from derender.postprocess import Features
+from derender.postprocess.fitting import coordinates_of
 from derender.postprocess.framing import Framing
 from derender.postprocess.whitening import Whitening
 from derender.scene.crop import back, crop_images, parameters_of, similarities, within
@@ -85,6 +86,16 @@ def test_features_follow_the_crop_less_than_without(model, heads):
                 pair = [one.embed(images)[name] for images in (whole, moved(whole, MOVES[1]))]
             likeness.append(float(torch.cosine_similarity(*pair).mean()))
         assert likeness[0] > max(0.85, likeness[1] + 0.1)
+
+
+def test_scenes_are_optimised_in_the_crop_that_is_found(model, heads):
+    fitting = model.with_features(model.features.with_steps(2))
+    images = interpolate(moved(heads[:4], MOVES[1]), (64, 64), mode="bilinear", antialias=True)
+    framed = model.whitening.framing(images)
+    assert not torch.equal(framed, images)
+    with torch.no_grad():
+        coordinates = fitting.activations(images)[coordinates_of("geometry")]
+    assert torch.equal(coordinates, fitting.fit_scenes(framed, 2).coordinates["geometry"])
 
 
 def test_a_network_is_kept_in_the_file_of_whitening(model, tmp_path):

@@ -202,7 +202,8 @@ class EmbeddingModel(nn.Module):
         framed = None if framing is None else framing(images)
         result = {f.name: self.factor_activations(f.name, images, framed=framed) for f in self.factors}
         if self.features.fits_scenes:
-            fitted = self._fitted(images, self.features.required_fitting().settings.steps).coordinates
+            steps = self.features.required_fitting().settings.steps
+            fitted = self._fitted(images if framed is None else framed, steps).coordinates
             result |= {coordinates_of(name): value for name, value in fitted.items()}
         return result
 
