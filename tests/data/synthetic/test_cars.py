@@ -7,8 +7,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from derender.data.synthetic import CarSettings, CarViewSettings, cars
-from derender.data.synthetic.cars import about_x, class_of
-from derender.data.synthetic.settings import CLASSES
+from derender.data.synthetic.cars import about_x, class_of, draw_traits
+from derender.data.synthetic.settings import CLASSES, numbers_of
 from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.scene.camera import project, rotation_matrix, to_camera
 
@@ -28,6 +28,15 @@ def test_every_class_occurs_soon_and_shares_are_kept(sample):
     assert names.count("police") == 0 and abs(names.count("jeep") - 150) <= 3
     styles = zip(sample.labels["class"], sample.labels["style"], strict=True)
     assert all(style in CLASSES[name] for name, style in styles)
+
+
+def test_every_condition_of_the_tables_can_hold():
+    """A misspelt one never would."""
+    tables, numbers = numbers_of("cars"), np.random.default_rng(0)
+    facts = {fact for name in 20 * list(CLASSES) for fact in draw_traits(name, numbers).facts}
+    rows = [row[4:] for chart in tables["shapes"].values() for row in chart]
+    rows += [row[5] for row in tables["fittings"]] + [row[2:] for row in tables["choices"].values()]
+    assert {one.removeprefix("not ") for conditions in rows for one in conditions} <= facts
 
 
 @pytest.mark.parametrize("number", range(12))

@@ -22,42 +22,25 @@ from scipy.spatial.transform import Rotation
 from derender.data.stream import Progress
 from derender.data.synthetic.car_body import (
     ARCH,
-    BED_FROM,
-    BED_TO,
     PARTS,
     CarShape,
-    Colour,
     Grid,
     Surface,
-    body_lines,
     body_pieces,
     both,
     half_width,
     join,
-    rounded_box,
     wheel,
     wheel_house,
 )
-from derender.data.synthetic.car_paint import (
-    BLACK,
-    CHROME,
-    WHITE,
-    CarTraits,
-    ambulance_paint,
-    box,
-    ellipse,
-    side_paint,
-    top_paint,
-    wheel_paint,
-)
+from derender.data.synthetic.car_paint import CarTraits, fittings, shapes, side_paint
 from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import CLASSES, CarSettings, drawn, numbers_of, pick
 from derender.data.synthetic.synthetic_set import FOV_DEG, Row, Shot, SyntheticSet, draw_background, make_set
 
 CANONICAL_ELEVATION_DEG = 42.5
 _GOLDEN = 0.6180339887498949
-_PAINT_WHITE, _PAINT_BLACK, _TYRE = (0.92, 0.92, 0.91), (0.075, 0.075, 0.08), (0.055, 0.055, 0.06)
-_BAR_BLUE, _BAR_RED = (0.05, 0.22, 0.95), (0.95, 0.05, 0.06)
+_PAINT_WHITE, _PAINT_BLACK = (0.92, 0.92, 0.91), (0.075, 0.075, 0.08)
 _PLACES = [name for name in CarShape._fields if name.endswith("_at")]
 _UP = ("height", "nose", "cowl", "deck", "tail", "bumper")
 _PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.15}  # chance of such bumpers
@@ -200,12 +183,12 @@ def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> C
 
 def build_car(car: CarTraits) -> TriangleMesh:
     """Mesh in metres (x right, y down, z to the rear; ground at y = 0) with its paint."""
-    s, jeep, black = car.shape, car.name == "jeep", Surface(BLACK)
+    s, jeep, black = car.shape, car.name == "jeep", Surface(car.colour("black"))
     wheels = (s.front_wheel, s.rear_wheel)
     holes = [] if jeep else [(at, s.wheel, ARCH * s.wheel) for at in wheels]
     side = Surface(car.paint, "body", side_paint(car), holes=holes)
-    pieces, flank = body_pieces(s, Surface(car.paint, "body", top_paint(car), folded=True), side)
-    tyre = Surface(_TYRE, "wheel", wheel_paint(car))
+    pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car), folded=True), side)
+    tyre = Surface(car.colour("tyre"), "wheel", shapes("wheel", car))
     template = wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
     for at in wheels:
         out, houses = s.width / 2 + 0.15, []
@@ -214,99 +197,18 @@ def build_car(car: CarTraits) -> TriangleMesh:
             out = half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
             houses = [wheel_house(out - 0.25, at, s, flank, black)]
         pieces += both([template._replace(points=template.points + np.array((out, 0.0, at))), *houses])
-    ahead, tall = (0.1, 0.15) if car.style in ("van", "cab") else (0.28, 0.08)
-    at, own = s.cowl_at + ahead, Surface(car.trim if car.plastic else car.paint)
-    mirror = half_width(flank, at, s.cowl - 0.05) + 0.09, s.cowl + 0.02 + tall, at
-    pieces += both(rounded_box(mirror, (0.11, tall, 0.05), 0.04, own))
-    fittings = {"police": _light_bar, "ambulance": _ambulance_box, "sports": _wing, "jeep": _jeep}
-    if car.name in fittings:
-        pieces += fittings[car.name](car)
-    if car.name in ("suv", "estate") and car.chances[9] < 0.7:
-        edge = body_lines(s, np.array([4.1, 4.5, 4.9])).edge
-        centre = (0.93 * edge[:, 0].min(), edge[:, 1].mean() + 0.05, edge[:, 2].mean())
-        rail = Surface(BLACK if car.chances[3] < 0.5 else CHROME)
-        pieces += both(rounded_box(centre, (0.025, 0.03, 0.5 * (edge[-1, 2] - edge[0, 2])), 0.02, rail))
-    return join(pieces)
+    beside = s.cowl_at + (0.1 if car.has(["upright"]) else 0.28)
+    pieces += fittings(car, half_width(flank, beside, s.cowl - 0.05) + 0.09)
+    return join([*pieces, *([_spare_wheel(car)] if jeep else [])])
 
 
-def _light_bar(car: CarTraits) -> list[Grid]:
-    middle, half, top = car.shape.screen_at + 0.42, 0.58, car.shape.height + 0.10
-    left: Colour = _BAR_RED if car.chances[8] < 0.6 else _BAR_BLUE
-    lamps = [box(-half - 0.1, -9, -0.16, 9, left, "light"), box(0.16, -9, half + 0.1, 9, _BAR_BLUE, "light")]
-    glass = Surface((0.85, 0.86, 0.9), "light", lamps)
-    return [
-        *rounded_box((0, top - 0.06, middle), (half, 0.05, 0.13), 0.03, Surface(BLACK)),
-        *rounded_box((0, top + 0.03, middle), (half + 0.04, 0.075, 0.16), 0.05, glass),
-    ]
-
-
-def _ambulance_box(car: CarTraits) -> list[Grid]:
+def _spare_wheel(car: CarTraits) -> Grid:
+    """Upright at the rear, or on its back on the bonnet."""
     s = car.shape
-    low, high, front, rear = s.sill + 0.32, s.height + 0.62, s.screen_at + 0.62, s.length
-    half, tall, long = s.width / 2 + 0.1, 0.5 * (high - low), 0.5 * (rear - front)
-    above, ahead, beside = ambulance_paint(car, low, high, front, rear)
-    roof, face = Surface(WHITE, "body", above), Surface(WHITE, "body", ahead, folded=True)
-    walls = roof, face, Surface(WHITE, "body"), Surface(WHITE, "body", beside)
-    middle = (0, low + tall, 0.5 * (front + rear))
-    lamp = Surface(_BAR_RED if car.livery != 2 and car.chances[8] < 0.5 else _BAR_BLUE, "light")
-    return [
-        *rounded_box(middle, (half, tall, long), 0.07, walls),
-        *both(rounded_box((half - 0.3, high - 0.02, front + 0.08), (0.24, 0.12, 0.14), 0.05, lamp)),
-        *both(rounded_box((half - 0.3, high - 0.02, rear - 0.12), (0.2, 0.09, 0.1), 0.04, lamp)),
-        *rounded_box((0, s.height + 0.07, s.screen_at + 0.2), (0.55, 0.08, 0.13), 0.05, lamp),
-    ]
-
-
-def _wing(car: CarTraits) -> list[Grid]:
-    s = car.shape
-    half, at = 0.86 * s.width / 2, s.tail_at - 0.1
-    own = Surface(car.paint, "body") if car.chances[6] < 0.55 else Surface(BLACK)
-    if car.chances[5] < 0.25:
-        return rounded_box((0, s.tail + 0.05, s.tail_at - 0.04), (half, 0.04, 0.13), 0.035, own, 0.3)
-    height = s.tail + 0.24 + 0.12 * car.chances[7]
-    stand = (0.025, 0.5 * (height - s.tail) + 0.02, 0.09)
-    return [
-        *both(rounded_box((0.6 * half, 0.5 * (s.tail + height), at), stand, 0.02, own)),
-        *both(rounded_box((half + 0.01, height + 0.03, at), (0.02, 0.1, 0.18), 0.015, own)),
-        *rounded_box((0, height, at), (half, 0.03, 0.17), 0.025, own, 0.12),
-    ]
-
-
-def _jeep(car: CarTraits) -> list[Grid]:
-    s, black = car.shape, Surface(car.trim)
-    inner, outer = 0.55 * s.width / 2, s.width / 2 + 0.16
-    pieces = rounded_box((0, s.bumper - 0.04, -0.06), (0.95 * s.width / 2, 0.11, 0.12), 0.03, black)
-    for at in (s.front_wheel, s.rear_wheel):
-        centre, half = (0.5 * (inner + outer), 2 * s.wheel + 0.08, at), 0.5 * (outer - inner)
-        pieces += both(rounded_box(centre, (half, 0.05, 1.25 * s.wheel), 0.04, black))
-    spare = Surface(_TYRE, "wheel", [*wheel_paint(car), ellipse(0, 0, (0.34, 0.34), BLACK)])
-    if car.style == "jeep_hard" and car.chances[8] < 0.35:  # on its back on the bonnet
-        lying = wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
-        middle = (0, 0.5 * (s.nose + s.cowl) + 0.16, 0.55 * (s.nose_at + s.cowl_at))
-        points = (lying.points - lying.points[0, 0])[..., [0, 2, 1]] * (1.0, 1.0, -1.0) + middle
-        pieces.append(lying._replace(points=points, normals=lying.normals[..., [0, 2, 1]] * (1.0, -1.0, 1.0)))
-    else:
-        pieces.append(wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True))
-    return pieces + (_open_cabin(car) if car.style == "jeep_open" else [])
-
-
-def _open_cabin(car: CarTraits) -> list[Grid]:
-    s, roll = car.shape, Surface(BLACK)
-    half, x = 0.92 * s.width / 2, 0.78 * s.width / 2
-    frame: Colour = car.paint if car.chances[6] < 0.5 else car.trim
-    pane = box(-0.86 * half, s.cowl + 0.06, 0.86 * half, s.cowl + 0.46, car.glass, "window")
-    plain, glazed = Surface(frame), Surface(frame, "trim", [pane])
-    start, end = body_lines(s, np.array([BED_FROM, BED_TO])).middle[:, 2]
-    bar_at, top = start + 0.5 * (end - start), s.cowl + 0.56
-    seat = Surface((0.36, 0.27, 0.18) if car.chances[4] < 0.5 else (0.13, 0.13, 0.14))
-    screen, walls = (0, s.cowl + 0.26, s.cowl_at + 0.14), (plain, glazed, glazed, plain)
-    post, stay = (0.045, 0.5 * (top - 0.6), 0.045), (x, 0.5 * (top + s.cowl), bar_at + 0.42)
-    return [
-        *rounded_box(screen, (half, 0.28, 0.025), 0.02, walls, 0.22),
-        *both(rounded_box((x, 0.5 * (top + 0.6), bar_at), post, 0.04, roll)),
-        *rounded_box((0, top, bar_at), (x + 0.045, 0.045, 0.045), 0.04, roll),
-        *both(rounded_box(stay, (0.04, 0.4, 0.04), 0.035, roll, -0.8)),
-        *both(rounded_box((0.34, 0.98, bar_at - 0.24), (0.22, 0.36, 0.07), 0.06, seat, 0.2)),
-        *both(rounded_box((0.34, 0.70, bar_at - 0.5), (0.23, 0.09, 0.24), 0.06, seat)),
-        *rounded_box((0, 0.92, end - 0.42), (0.52, 0.3, 0.07), 0.06, seat, 0.2),
-    ]
+    spare = Surface(car.colour("tyre"), "wheel", shapes("wheel", car) + shapes("spare", car))
+    if car.has(["open"]) or not car.has(["spare on bonnet"]):
+        return wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True)
+    lying = wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
+    middle = (0, 0.5 * (s.nose + s.cowl) + 0.16, 0.55 * (s.nose_at + s.cowl_at))
+    points = (lying.points - lying.points[0, 0])[..., [0, 2, 1]] * (1.0, 1.0, -1.0) + middle
+    return lying._replace(points=points, normals=lying.normals[..., [0, 2, 1]] * (1.0, -1.0, 1.0))
