@@ -2,6 +2,7 @@
 
 import copy
 
+import pytest
 import torch
 
 from derender.evaluation.segmenters import SegmentationNet
@@ -52,64 +53,58 @@ def test_the_joint_net_uses_both_centres_once():
         assert (deaf(images) - before).abs().max() > 1e-3
 
 
-def test_frozen_encoders_keep_weights_and_statistics_while_the_decoder_learns():
-    net = SegmentationNet([encoder(0)], CLASSES, frozen=True).train()
-    free = SegmentationNet([encoder(0)], CLASSES).train()
-    for each, stays in ((net, True), (free, False)):
-        before = {name: value.clone() for name, value in each.encoders.state_dict().items()}
-        decoder = {name: value.clone() for name, value in each.decoder.state_dict().items()}
-        optimiser = torch.optim.Adam([p for p in each.parameters() if p.requires_grad], lr=1e-2)
-        each(torch.rand(4, 3, 32, 32)).square().mean().backward()
-        optimiser.step()
-        after = each.encoders.state_dict()
-        code = {name for name in before if ".to_code." in name}
-        assert all(torch.equal(before[name], after[name]) for name in (before if stays else code))
-        changed = [name for name in before if not torch.equal(before[name], after[name])]
-        assert stays or len(changed) == len(before) - len(code)
-        assert any(not torch.equal(value, each.decoder.state_dict()[name]) for name, value in decoder.items())
-
-
-def test_statistics_are_kept_while_weights_learn_where_asked_for():
-    net = SegmentationNet([encoder(0)], CLASSES, kept_statistics=True).train()
-    before = {name: value.clone() for name, value in net.encoders.state_dict().items()}
+def still_after_a_step(net: SegmentationNet) -> tuple[set[str], set[str]]:
+    """Which tensors of the encoders and of the decoder an optimiser's step leaves as they were."""
+    before = [copy.deepcopy(part.state_dict()) for part in (net.encoders, net.decoder)]
     optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=1e-2)
-    images = torch.rand(4, 3, 32, 32)
-    alone, together = net.encoders[0].spatial(images[:1]), net.encoders[0].spatial(images)[:1]
-    assert torch.allclose(alone, together, atol=1e-5)  # nobody's features hang on who else is in the batch
-    net(images).square().mean().backward()
+    net(torch.rand(4, 3, 32, 32)).square().mean().backward()
     optimiser.step()
-    after = net.encoders.state_dict()
-    same = {name for name in before if torch.equal(before[name], after[name])}
-    kept = ("running", "num_batches", "to_code")
-    assert same == {name for name in before if any(word in name for word in kept)}
-    assert not net.encoders.training and net.decoder.training
+    encoders, decoder = (
+        {name for name, value in part.state_dict().items() if torch.equal(value, old[name])}
+        for part, old in zip((net.encoders, net.decoder), before, strict=True)
+    )
+    return encoders, decoder
+
+
+def hangs_on_the_batch(encoder: UNetEncoder) -> list[bool]:
+    """Of each level, whether features of an image depend on who else is in the batch."""
+    images = torch.rand(4, 3, 32, 32)
+    pairs = zip(encoder.skips(images[:1]), encoder.skips(images), strict=True)
+    return [not torch.allclose(alone, together[:1], atol=1e-5) for alone, together in pairs]
+
+
+@pytest.mark.parametrize(
+    ("how", "still"),
+    [
+        ({}, ("to_code",)),
+        ({"frozen": True}, ("",)),  # every tensor
+        ({"kept_statistics": True}, ("running", "num_batches", "to_code")),
+    ],
+    ids=["all learn", "frozen encoders", "statistics are kept while weights learn"],
+)
+def test_encoders_learn_or_stay_as_asked_for_while_the_decoder_learns(how, still):
+    net = SegmentationNet([encoder(0)], CLASSES, **how).train()
+    assert hangs_on_the_batch(net.encoders[0]) == 4 * [not how]
+    kept, decoder = still_after_a_step(net)
+    assert kept == {name for name in net.encoders.state_dict() if any(word in name for word in still)}
+    assert not decoder and net.encoders.training == (not how) and net.decoder.training
 
 
 def test_a_decoder_that_has_learnt_is_taken_but_for_its_last_layer():
     learnt = pixel_decoder(NetworkSettings(image_size=32, encoder="unet", unet_width=WIDTH))
-    before = {name: value.clone() for name, value in learnt.state_dict().items()}
-    pair = [encoder(0), encoder(1)]
-    net = SegmentationNet(pair, CLASSES, kept_statistics=True, decoder=learnt).train()
-    taken = {name: value.clone() for name, value in net.decoder.state_dict().items()}
+    before = copy.deepcopy(learnt.state_dict())
+    net = SegmentationNet([encoder(0), encoder(1)], CLASSES, kept_statistics=True, decoder=learnt).train()
+    taken = net.decoder.state_dict()
     ends = {"to_outputs.weight", "to_outputs.bias"}
     assert all(torch.equal(before[name], taken[name]) for name in before.keys() - ends)
     assert taken["to_outputs.weight"].shape == (CLASSES, WIDTH, 1, 1)
-    encoders = {name: value.clone() for name, value in net.encoders.state_dict().items()}
-    optimiser = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], lr=1e-2)
-    images = torch.rand(4, 3, 32, 32)
-    alone, together = net.encoders[0].skips(images[:1]), net.encoders[0].skips(images)
-    hangs = [not torch.allclose(one, all_[:1], atol=1e-5) for one, all_ in zip(alone, together, strict=True)]
-    assert hangs == [False, False, True, True]  # on who else is in the batch
-    net(images).square().mean().backward()
-    optimiser.step()
-    same = {name for name, value in net.encoders.state_dict().items() if torch.equal(value, encoders[name])}
-    outer = {name for name in encoders if name[2:10] in ("levels.0", "levels.1")}
+    assert hangs_on_the_batch(net.encoders[0]) == [False, False, True, True]
+    encoders, decoder = still_after_a_step(net)
+    outer = {name for name in net.encoders.state_dict() if name[2:10] in ("levels.0", "levels.1")}
     outer -= {name for name in outer if name.endswith(("weight", "bias"))}
-    assert same == outer | {name for name in encoders if "to_code" in name}
-    after = net.decoder.state_dict()
-    still = {name for name in taken if torch.equal(taken[name], after[name])}
+    assert encoders == outer | {name for name in net.encoders.state_dict() if "to_code" in name}
     statistics = {name for name in taken if "running" in name or "num_batches" in name}
-    assert still == {name for name in statistics if name.startswith(("convolve.1.", "convolve.2."))}
+    assert decoder == {name for name in statistics if name.startswith(("convolve.1.", "convolve.2."))}
     assert len(net.decoder.convolve) == 3
     assert all(torch.equal(value, before[name]) for name, value in learnt.state_dict().items())
     assert not any(parameter.requires_grad for parameter in learnt.parameters())

@@ -102,7 +102,10 @@ def test_sizes_are_read_off_and_every_tensor_finds_its_place(checkpoint, file):
 
 
 def test_the_networks_compute_what_the_layers_of_the_paper_compute(checkpoint, file):
-    """The camera's numbers, by torch's own layers with the paper's strides and paddings."""
+    """Camera and light, by torch's own layers with the paper's strides and paddings.
+
+    Light has x, then y in the file; pitch (y), then yaw (x) here.
+    """
     model = Derenderer.from_unsup3d(file)
     images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(1))
     for net, name in (("netV", "camera"), ("netL", "light")):
@@ -112,15 +115,6 @@ def test_the_networks_compute_what_the_layers_of_the_paper_compute(checkpoint, f
         values = torch.conv2d(torch.conv2d(values, tensors[4]).relu(), tensors[5]).tanh().flatten(1)
         expected = values[:, [0, 1, 3, 2]] if name == "light" else values
         torch.testing.assert_close(model.nets[name](images), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_light_from_the_left_and_above_stays_there(checkpoint, tmp_path):
-    """x, then y in the file; pitch (y), then yaw (x) here."""
-    _, weights = read_checkpoint(saved(checkpoint, tmp_path))
-    theirs = list(checkpoint["netL"].values())[-1].flatten(1)
-    ours = weights["nets.light.decoder.linear.weight"]
-    for row, from_row in enumerate((0, 1, 3, 2)):
-        assert torch.equal(ours[row], theirs[from_row])
 
 
 def saved(content: object, folder: Path, **options) -> Path:

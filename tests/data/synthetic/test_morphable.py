@@ -8,6 +8,7 @@ import pytest
 
 from derender.data.layouts.faces import MASK_CLASSES
 from derender.data.synthetic import LIGHTS, VIEWS, FaceSettings, MorphableFaces, faces
+from derender.data.synthetic.morphable import NOSE_TIP_Z
 
 ROOT = Path(__file__).resolve().parents[3]
 AHEAD = FaceSettings(view=VIEWS["frontal"], light=LIGHTS["frontal"], pictures_per_identity=1)
@@ -40,7 +41,7 @@ def test_a_model_is_pictured_with_its_own_geometry(tmp_path):
     made = faces.generate(6, settings=AHEAD, seed=1, model=saved(tmp_path / "m.npz"))
     assert made.mask.mean(axis=(1, 2)).min() > 0.4
     middle = made.depth[:, 31:33, 31:33].min(axis=(1, 2))
-    assert np.allclose(middle, faces.NOSE_TIP_Z, atol=1e-3)
+    assert np.allclose(middle, NOSE_TIP_Z, atol=1e-3)
     assert (made.depth[:, 32, 32] < made.depth[:, 32, 12]).all()
     assert np.allclose(made.normal[:, 32, 32], [0, 0, 1], atol=0.1)
     assert (made.normal[:, 32, 12, 0] > 0.2).all()  # inward: the left flank's normal points right

@@ -11,9 +11,10 @@ Points are metres, x right, y UP from the ground, z from the front to the rear; 
 grid's columns and rows are ordered so that d/dcolumn x d/drow points inwards. Leaves out undersides.
 """
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,12 +23,15 @@ from numpy import ndarray
 
 from derender.data.synthetic.decals import DECAL_LENGTH, Paint
 from derender.data.synthetic.mesh_image import TriangleMesh, grid_triangles, unit
+from derender.data.synthetic.settings import numbers_of
 
 PARTS = ("background", "body", "window", "wheel", "light", "trim", "plate")
 ARCH = 1.13  # radius of the wheel arches in wheel radii
 BED_FROM, BED_TO, BED_SIDE = 6.12, 6.93, 0.86
 Colour = tuple[float, float, float]
 Decal = tuple[float, ...]  # the columns of one shape, as in mesh_image
+Places = Mapping[str, float]
+"""Lengths by name, as ``cars.yaml`` uses them."""
 _LAST = 9  # station
 _ROWS_BETWEEN = (4, 6, 9, 10, 8, 10, 9, 6, 4)  # rows from each station to the next
 _ACROSS = np.array([0.0, 0.22, 0.44, 0.62, 0.76, BED_SIDE, BED_SIDE + 0.02, 0.93, 0.97, 1.0])
@@ -209,6 +213,20 @@ def half_width(flank: Float[ndarray, "points 3"], z: Any, y: Any) -> Any:
     return flank[np.argmin(away, axis=-1), 0]
 
 
+@cache
+def _terms(text: str) -> list[tuple[float, str]]:
+    """Number and place of each term of a length: those of "0.5 width - 0.1" are 0.5 width and -0.1."""
+    terms = re.findall(r"([+-]?) ?([\d.]*) ?([a-z_]*)", text)
+    return [(float(f"{sign}{number or 1}"), place) for sign, number, place in terms if number or place]
+
+
+def metres(length: str | float, places: Places) -> float:
+    """A length of ``cars.yaml``; lengths on charts have the chart's units."""
+    if not isinstance(length, str):
+        return length
+    return sum(number * places[place] if place else number for number, place in _terms(length))
+
+
 class BodyLines(NamedTuple):
     """The lines that paint follows, each (stations, 3): middle, upper edge, waist and sill."""
 
@@ -261,37 +279,15 @@ def body_pieces(
 
 
 def _table(s: CarShape) -> Float[ndarray, "stations 12"]:
-    """Middle (x = 0), upper edge, waist and sill at each station."""
-    w, end = s.width / 2, s.length
-    belt, back_belt = s.cowl + 0.02, max(s.cowl + 0.02, s.deck - 0.04)
-    glass, top, bonnet = w - 0.035, w - 0.035 - s.tumblehome, w - 0.07
-    cabin = s.deck_at - s.cowl_at
+    """Middle (x = 0), upper edge, waist and sill at each station, as ``cars.yaml`` lists them."""
+    glass, top, belt = 0.035, 0.035 + s.tumblehome, s.cowl + 0.02
+    back_belt = max(belt, s.deck - 0.04)
     if s.bed > 0 and s.screen_at - s.cowl_at < 0.2:  # an open top
-        glass, top, belt, back_belt = w - 0.01, w - 0.06, s.cowl - 0.06, s.deck - 0.06
-    middle = np.array([
-        (0, s.sill, 0.12), (0, s.bumper, 0.0), (0, s.nose, s.nose_at), (0, s.cowl, s.cowl_at),
-        (0, s.height, s.screen_at), (0, s.height - s.roof_drop, s.roof_end_at), (0, s.deck, s.deck_at),
-        (0, s.tail, s.tail_at), (0, s.bumper + 0.05, end), (0, s.sill + 0.04, end - 0.1),
-    ])  # fmt: skip
-    edge = middle.copy()
-    edge[:, 0] = [
-        0.86 * w, 0.90 * w - 0.6 * s.hood_inset, 0.90 * w - s.hood_inset, bonnet - 0.02, top, top - 0.02,
-        bonnet, 0.91 * w, 0.92 * w, 0.88 * w,
-    ]  # fmt: skip
-    edge[:, 2] += np.array([0.7, 1.0, 0.9, 0.35, 0.25, -0.12, -0.25, -0.5, -0.55, -0.5]) * s.bow
-    edge[2:8, 1] -= [0.03, 0.045, 0.05, 0.05, 0.03, 0.02]
-    waist = edge + np.array([
-        (0.04 * w, 0.01, 0.05), (0.06 * w, -0.01, 0.05), (0.06 * w, -0.07, 0.06), (0.05, -0.06, 0.03),
-        (0, 0, 0), (0, 0, 0), (0.05, -0.05, 0.0), (0.04 * w, -0.06, -0.04), (0.04 * w, -0.01, -0.05),
-        (0.05 * w, 0.01, -0.04),
-    ])  # fmt: skip
-    waist[4:6] = (glass, belt, s.cowl_at + 0.42 * cabin), (glass, back_belt, s.cowl_at + 0.78 * cabin)
-    below = waist.copy()
-    below[:, 0] = w * np.array([0.91, 0.94, *[0.95] * 6, 0.94, 0.91])
-    below[1:-1, 1] = s.sill
-    below[1:3, 2] += [0.10, 0.16]
-    below[7:9, 2] -= [0.16, 0.10]
-    return np.concatenate([middle, edge, waist, below], axis=1)
+        glass, top, belt, back_belt = 0.01, 0.06, s.cowl - 0.06, s.deck - 0.06
+    places = {**s._asdict(), "glass": glass, "top": top, "belt": belt, "back_belt": back_belt}
+    lines = numbers_of("cars")["lines"].values()
+    table = [[metres(length, places) for length in (*x, *y, *z)] for x, y, z in lines]
+    return np.reshape(table, (len(lines), 3, -1)).transpose(2, 0, 1).reshape(_LAST + 1, -1)
 
 
 def _half(s: CarShape, stations: ndarray) -> Float[ndarray, "t c 3"]:

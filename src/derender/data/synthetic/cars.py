@@ -20,20 +20,8 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from derender.data.stream import Progress
-from derender.data.synthetic.car_body import (
-    ARCH,
-    PARTS,
-    CarShape,
-    Grid,
-    Surface,
-    body_pieces,
-    both,
-    half_width,
-    join,
-    wheel,
-    wheel_house,
-)
-from derender.data.synthetic.car_paint import CarTraits, fittings, shapes, side_paint
+from derender.data.synthetic.car_body import PARTS, CarShape
+from derender.data.synthetic.car_parts import CarTraits, build_car
 from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import CLASSES, CarSettings, drawn, numbers_of, pick
 from derender.data.synthetic.synthetic_set import FOV_DEG, Row, Shot, SyntheticSet, draw_background, make_set
@@ -179,36 +167,3 @@ def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> C
     for name in ("length", "rear_wheel", "roof_end_at", "deck_at", "tail_at"):
         drawn_row[name] += stretch
     return CarShape(**drawn_row)
-
-
-def build_car(car: CarTraits) -> TriangleMesh:
-    """Mesh in metres (x right, y down, z to the rear; ground at y = 0) with its paint."""
-    s, jeep, black = car.shape, car.name == "jeep", Surface(car.colour("black"))
-    wheels = (s.front_wheel, s.rear_wheel)
-    holes = [] if jeep else [(at, s.wheel, ARCH * s.wheel) for at in wheels]
-    side = Surface(car.paint, "body", side_paint(car), holes=holes)
-    pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car), folded=True), side)
-    tyre = Surface(car.colour("tyre"), "wheel", shapes("wheel", car))
-    template = wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
-    for at in wheels:
-        out, houses = s.width / 2 + 0.15, []
-        if not jeep:
-            z, y = np.meshgrid([-1.1, 0.0, 1.1], [0.8, 1.2])
-            out = half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
-            houses = [wheel_house(out - 0.25, at, s, flank, black)]
-        pieces += both([template._replace(points=template.points + np.array((out, 0.0, at))), *houses])
-    beside = s.cowl_at + (0.1 if car.has(["upright"]) else 0.28)
-    pieces += fittings(car, half_width(flank, beside, s.cowl - 0.05) + 0.09)
-    return join([*pieces, *([_spare_wheel(car)] if jeep else [])])
-
-
-def _spare_wheel(car: CarTraits) -> Grid:
-    """Upright at the rear, or on its back on the bonnet."""
-    s = car.shape
-    spare = Surface(car.colour("tyre"), "wheel", shapes("wheel", car) + shapes("spare", car))
-    if car.has(["open"]) or not car.has(["spare on bonnet"]):
-        return wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True)
-    lying = wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
-    middle = (0, 0.5 * (s.nose + s.cowl) + 0.16, 0.55 * (s.nose_at + s.cowl_at))
-    points = (lying.points - lying.points[0, 0])[..., [0, 2, 1]] * (1.0, 1.0, -1.0) + middle
-    return lying._replace(points=points, normals=lying.normals[..., [0, 2, 1]] * (1.0, -1.0, 1.0))

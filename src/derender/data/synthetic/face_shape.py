@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Float32, Int32
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
@@ -61,6 +61,17 @@ class FaceShape:
     names: tuple[str, ...]  # of the modes: one displacement per trait of shape
     modes: Float[ndarray, "modes rows columns 3"]
     actions: list[Float[ndarray, "rows columns 3"]]  # displacement by left and right half of each of ACTIONS
+
+
+@dataclass(frozen=True)
+class Expression:
+    """What one image's draw does to a face: ``sides`` are weights of each half of ACTIONS and LID_ACTIONS,
+    ``gaze`` is in face pixels."""
+
+    name: str
+    strength: float
+    sides: Float32[ndarray, "actions 2"]
+    gaze: Float32[ndarray, "2"]
 
 
 @lru_cache(maxsize=4)

@@ -1,4 +1,4 @@
-"""The colour of a face (albedo free of shading), its parts, and the hair that grows on it.
+"""The built-in faces: the colour of a face (albedo free of shading), its parts, the hair that grows on it.
 
 Hair is part of the head's surface: it grows above a line around the head, given as a row ``q`` for each
 angle, and lifts the surface by its thickness. Eyes and the inside of the mouth change from image to image and
@@ -6,7 +6,8 @@ are painted over it: lids follow the expression, irises the gaze; the mouth's in
 have parted. Leaves out highlights, single strands, plaits, and hair that hangs free of the head.
 """
 
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +16,14 @@ from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
 from derender.data import MASK_CLASSES
-from derender.data.synthetic.face_identity import SKIN_FIELDS, Identity
+from derender.data.synthetic.face_identity import SKIN_FIELDS, Identity, draw_identity, identity_columns
 from derender.data.synthetic.face_shape import (
+    ACTIONS,
     EYE_P,
     EYE_Q,
     MOUTH_BAND,
     MOUTH_Q,
+    Expression,
     FaceGrid,
     FaceShape,
     age_lines,
@@ -30,7 +33,10 @@ from derender.data.synthetic.face_shape import (
     hill,
     smoothstep,
 )
-from derender.data.synthetic.settings import numbers_of
+from derender.data.synthetic.mesh_image import TriangleMesh
+from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshOf
+from derender.data.synthetic.settings import FaceSettings, numbers_of
+from derender.data.synthetic.synthetic_set import Row
 
 PART = {name: number for number, name in enumerate(MASK_CLASSES)}
 _FIELD_SEED = 7  # the noise fields are part of the model, the same for everyone; identities mix them
@@ -40,6 +46,8 @@ _LASH, _SCLERA, _PINK, _PUPIL, _TOOTH, _DARK, _TONGUE = np.array([
     (0.15, 0.05, 0.05), (0.60, 0.26, 0.25),
 ], np.float32)[..., None, None]  # fmt: skip
 _IRIS_RADIUS, _PUPIL_RADIUS = 2.4, 1.0
+_FACE_PX = float(np.tan(np.deg2rad(5.0)) / 31.5)  # scene units per face pixel at z = 1
+_DOWN_PX = 2.6  # the face sits this much below the middle, so that hair shows
 
 
 class HairStyle(NamedTuple):
@@ -321,6 +329,57 @@ def paint_mouth(
     _over(colour, line, cover)
     albedo[:, *at] = colour
     parts[at] = np.where((cover > 0.5) & (parted > 0.5), PART["mouth"], parts[at])
+
+
+@dataclass(frozen=True)
+class ProceduralFaces:
+    """The built-in faces; a user's own morphable model has the same method."""
+
+    shape: FaceShape
+    fields: dict[str, ndarray]
+
+    @classmethod
+    def of(cls, detail: float) -> "ProceduralFaces":
+        """Those on a grid of that ``detail``."""
+        return cls(face_shape(detail), skin_fields(detail))
+
+    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshOf, Row, Row]:
+        """One identity: its mesh by expression, its labels, and its traits for tables."""
+        shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
+        who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
+        skin = paint_skin(who, shape, self.fields)
+        surface = shape.mean.copy()
+        for weight, mode in zip(who["shape"].values(), shape.modes, strict=True):
+            surface += np.float32(weight) * mode
+        if not hair_style(who).covers_ears:
+            surface += np.float32(who["ear_size"]) * shape.ear
+        tip = float(surface[..., 2].min()) * who["scale"]
+        surface += skin.thickness[..., None] * shape.outward
+        surface[..., 2] -= skin.forward
+        labels: Row = {"age": round(who["age_years"], 1), "skin_tone": round(who["melanin"], 4)}
+        labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
+        labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
+        surface *= np.float32(who["scale"])
+        return partial(self._mesh, who, surface, tip, skin), labels, identity_columns(who)
+
+    def _mesh(
+        self, who: Identity, neutral: Float32[ndarray, "rows columns 3"], nose_tip: float, skin: Skin,
+        expression: Expression,
+    ) -> TriangleMesh:  # fmt: skip
+        """A neutral surface (face pixels) with an expression, in scene units; eyes and mouth painted."""
+        grid, scale, sides = self.shape.grid, np.float32(who["scale"]), expression.sides
+        surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
+        for a, side in np.argwhere(sides[: len(ACTIONS)]):
+            surface += sides[a, side] * scale * self.shape.actions[2 * a + side]
+        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
+        paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
+        paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
+        surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
+        surface *= np.float32(_FACE_PX)
+        surface[..., 2] += np.float32(NOSE_TIP_Z)
+        surface[..., 2] -= 1.0
+        colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
+        return TriangleMesh(surface.reshape(-1, 3), self.shape.triangles, colours, parts.ravel())
 
 
 def _single(values: Any) -> ndarray:

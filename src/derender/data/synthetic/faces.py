@@ -7,39 +7,18 @@ Conventions are those of docs/reference/conventions.md; nose tips of neutral fac
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 from numpy import ndarray
 
 from derender.data import MASK_CLASSES, Progress
-from derender.data.synthetic.face_identity import Identity, draw_identity, identity_columns
-from derender.data.synthetic.face_shape import (
-    ACTIONS,
-    LID_ACTIONS,
-    MOUTH_BAND,
-    MOUTH_Q,
-    FaceShape,
-    face_shape,
-)
-from derender.data.synthetic.face_skin import (
-    Skin,
-    hair_style,
-    paint_eyes,
-    paint_mouth,
-    paint_skin,
-    skin_fields,
-)
-from derender.data.synthetic.mesh_image import TriangleMesh
-from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshOf, MorphableFaces
+from derender.data.synthetic.face_shape import ACTIONS, LID_ACTIONS, Expression
+from derender.data.synthetic.face_skin import ProceduralFaces
+from derender.data.synthetic.morphable import MorphableFaces
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
 
-FACE_PX = float(np.tan(np.deg2rad(5.0)) / 31.5)  # scene units per face pixel at z = 1
-_DOWN_PX = 2.6  # the face sits this much below the middle, so that hair shows
 _DRIFT = np.array([*np.deg2rad([8.0, 18.0, 5.0]), 0.005, 0.005, 0.0])  # how far a head moves within a track
 
 
@@ -54,7 +33,7 @@ def generate(
     """
     settings = settings or FaceSettings()
     detail = float(np.clip(np.ceil(image_size / 64 * 2) / 2, 1.0, 3.0))  # of the grid
-    family = ProceduralFaces(face_shape(detail), skin_fields(detail)) if model is None else model
+    family = ProceduralFaces.of(detail) if model is None else model
     family = MorphableFaces.read(family) if isinstance(family, (str, Path)) else family
 
     def shots(indices: list[int]) -> Iterator[Shot]:
@@ -66,17 +45,6 @@ def generate(
 
     size = settings.per_identity
     return make_set(shots, count, image_size, seed, first, size, MASK_CLASSES, progress, settings.effects)
-
-
-@dataclass(frozen=True)
-class Expression:
-    """What one image's draw does to a face: ``sides`` are weights of each half of ACTIONS and LID_ACTIONS,
-    ``gaze`` is in face pixels."""
-
-    name: str
-    strength: float
-    sides: Float32[ndarray, "actions 2"]
-    gaze: Float32[ndarray, "2"]
 
 
 def draw_face(
@@ -126,49 +94,3 @@ def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
     if view.yaw_beyond_deg > 0:
         values[1] = drawn(view.yaw_deg, uniform[1], view.yaw_beyond_deg)
     return np.array([*np.deg2rad(values[:3]), *values[3:], 0.0])
-
-
-@dataclass(frozen=True)
-class ProceduralFaces:
-    """The built-in faces; a user's own morphable model has the same method."""
-
-    shape: FaceShape
-    fields: dict[str, ndarray]
-
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshOf, Row, Row]:
-        """One identity: its mesh by expression, its labels, and its traits for tables."""
-        shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
-        who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
-        skin = paint_skin(who, shape, self.fields)
-        surface = shape.mean.copy()
-        for weight, mode in zip(who["shape"].values(), shape.modes, strict=True):
-            surface += np.float32(weight) * mode
-        if not hair_style(who).covers_ears:
-            surface += np.float32(who["ear_size"]) * shape.ear
-        tip = float(surface[..., 2].min()) * who["scale"]
-        surface += skin.thickness[..., None] * shape.outward
-        surface[..., 2] -= skin.forward
-        labels: Row = {"age": round(who["age_years"], 1), "skin_tone": round(who["melanin"], 4)}
-        labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
-        labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
-        surface *= np.float32(who["scale"])
-        return partial(self._mesh, who, surface, tip, skin), labels, identity_columns(who)
-
-    def _mesh(
-        self, who: Identity, neutral: Float32[ndarray, "rows columns 3"], nose_tip: float, skin: Skin,
-        expression: Expression,
-    ) -> TriangleMesh:  # fmt: skip
-        """A neutral surface (face pixels) with an expression, in scene units; eyes and mouth painted."""
-        grid, scale, sides = self.shape.grid, np.float32(who["scale"]), expression.sides
-        surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
-        for a, side in np.argwhere(sides[: len(ACTIONS)]):
-            surface += sides[a, side] * scale * self.shape.actions[2 * a + side]
-        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
-        paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
-        paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
-        surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
-        surface *= np.float32(FACE_PX)
-        surface[..., 2] += np.float32(NOSE_TIP_Z)
-        surface[..., 2] -= 1.0
-        colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
-        return TriangleMesh(surface.reshape(-1, 3), self.shape.triangles, colours, parts.ravel())

@@ -1,4 +1,4 @@
-"""What is on a car, as ``cars.yaml`` lists it: shapes of paint, and boxes; and what follows the body's lines.
+"""A car put together: body and wheels, the shapes of paint and the boxes on them that ``cars.yaml`` lists.
 
 There are two charts. (share of the half width, station) is on top, where one row of shapes suits every body
 style. (z, y) in metres is beside, where windows follow the body's lines. Police cars, ambulances and sports
@@ -7,15 +7,15 @@ and a cross or a six-pointed star. None is that of an existing service. Leaves o
 and lettering that can be read.
 """
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from derender.data.synthetic.car_body import (
+    ARCH,
     BED_FROM,
     BED_TO,
     PARTS,
@@ -24,18 +24,24 @@ from derender.data.synthetic.car_body import (
     Colour,
     Decal,
     Grid,
+    Places,
     Surface,
     body_lines,
+    body_pieces,
     both,
+    half_width,
+    join,
+    metres,
     rounded_box,
+    wheel,
+    wheel_house,
 )
 from derender.data.synthetic.decals import BOX, DECAL_LENGTH, ELLIPSE, MOST_CORNERS
+from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import drawn, numbers_of
 
 Finish = tuple[float, ...]
 """Columns of a shape: whether its colour multiplies that below, its part or -1, its colour."""
-Places = Mapping[str, float]
-"""Lengths by name, as ``cars.yaml`` uses them."""
 Lengths = Sequence[str | float]
 
 
@@ -109,18 +115,37 @@ class CarTraits:
         return name
 
 
-@cache
-def _terms(text: str) -> list[tuple[float, str]]:
-    """Number and place of each term of a length: those of "0.5 width - 0.1" are 0.5 width and -0.1."""
-    terms = re.findall(r"([+-]?) ?([\d.]*) ?([a-z_]*)", text)
-    return [(float(f"{sign}{number or 1}"), place) for sign, number, place in terms if number or place]
+def build_car(car: CarTraits) -> TriangleMesh:
+    """Mesh in metres (x right, y down, z to the rear; ground at y = 0) with its paint."""
+    s, jeep, black = car.shape, car.name == "jeep", Surface(car.colour("black"))
+    wheels = (s.front_wheel, s.rear_wheel)
+    holes = [] if jeep else [(at, s.wheel, ARCH * s.wheel) for at in wheels]
+    side = Surface(car.paint, "body", side_paint(car), holes=holes)
+    pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car), folded=True), side)
+    tyre = Surface(car.colour("tyre"), "wheel", shapes("wheel", car))
+    template = wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
+    for at in wheels:
+        out, houses = s.width / 2 + 0.15, []
+        if not jeep:
+            z, y = np.meshgrid([-1.1, 0.0, 1.1], [0.8, 1.2])
+            out = half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
+            houses = [wheel_house(out - 0.25, at, s, flank, black)]
+        pieces += both([template._replace(points=template.points + np.array((out, 0.0, at))), *houses])
+    beside = s.cowl_at + (0.1 if car.has(["upright"]) else 0.28)
+    pieces += fittings(car, half_width(flank, beside, s.cowl - 0.05) + 0.09)
+    return join([*pieces, *([_spare_wheel(car)] if jeep else [])])
 
 
-def metres(length: str | float, places: Places) -> float:
-    """A length of ``cars.yaml``; lengths on charts have the chart's units."""
-    if not isinstance(length, str):
-        return length
-    return sum(number * places[place] if place else number for number, place in _terms(length))
+def _spare_wheel(car: CarTraits) -> Grid:
+    """Upright at the rear, or on its back on the bonnet."""
+    s = car.shape
+    spare = Surface(car.colour("tyre"), "wheel", shapes("wheel", car) + shapes("spare", car))
+    if car.has(["open"]) or not car.has(["spare on bonnet"]):
+        return wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True)
+    lying = wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
+    middle = (0, 0.5 * (s.nose + s.cowl) + 0.16, 0.55 * (s.nose_at + s.cowl_at))
+    points = (lying.points - lying.points[0, 0])[..., [0, 2, 1]] * (1.0, 1.0, -1.0) + middle
+    return lying._replace(points=points, normals=lying.normals[..., [0, 2, 1]] * (1.0, -1.0, 1.0))
 
 
 def shapes(chart: str, car: CarTraits, **more: float) -> list[Decal]:
