@@ -36,6 +36,15 @@ class Lighting(NamedTuple):
     maps: ndarray  # (L, R, R) float32: how near to the lamp the nearest surface is; (0, 0, 0) for no shadows
 
 
+def lighting(
+    ambient: np.float32, lamps: Float[ndarray, "lamps 4"], gloss: ndarray, haze: ndarray, shadows_px: int
+) -> Lighting:
+    """Light with room for shadow maps of an image so many pixels wide (0: none), which drawing fills."""
+    room = (len(lamps), TEXELS * shadows_px, TEXELS * shadows_px) if shadows_px else (0, 0, 0)
+    empty = (np.zeros(shape, np.float32) for shape in ((len(lamps), 2, 3), (3,), room))
+    return Lighting(ambient, lamps.astype(np.float32), gloss, haze, *empty)
+
+
 @kernel
 def is_plain(lighting):
     more = len(lighting.lamps) > 1 or len(lighting.maps) > 0

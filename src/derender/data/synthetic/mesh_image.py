@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int32
 from numpy import ndarray
 
 from derender.data.synthetic.decals import NO_PAINT, SAMPLES, Paint, paint_samples
-from derender.data.synthetic.lighting import TEXELS, Lighting, axes_about, depths_seen, is_plain, light_at
+from derender.data.synthetic.lighting import Lighting, axes_about, depths_seen, is_plain, light_at
 from derender.render.numba_threads import kernel
 
 _ALL = SAMPLES * SAMPLES
@@ -73,7 +73,9 @@ def draw_mesh(
     light: Lighting, background: Float32[ndarray, "s s 3"], focal_px: np.float32, out: ImageMaps,
 ) -> None:  # fmt: skip
     """Fill ``out`` with the mesh, turned and moved to (0, 0, 1) + ``translation``, before a background of
-    0..1."""
+    0..1; and the light's shadow maps."""
+    if len(light.maps):
+        _cast_shadows(mesh, rotation, translation, light)
     places, more = _place(mesh, rotation, translation, focal_px, len(background), light)
     nearest = np.zeros((SAMPLES * len(background), SAMPLES * len(background)), np.float32)
     owner = np.full(nearest.shape, -1, np.int32)
@@ -294,31 +296,18 @@ def _store(target, i, j, colour):
         target[n, i, j] = np.uint8(min(max(colour[n], _ZERO), _ONE) * np.float32(255.0) + np.float32(0.5))
 
 
-def lit_by(
-    mesh: TriangleMesh, rotation: Float32[ndarray, "3 3"], translation: Float32[ndarray, "3"],
-    ambient: float, lamps: Float32[ndarray, "lamps 4"], gloss: Float32[ndarray, "2"],
-    haze: Float32[ndarray, "2"], shadows: bool, image_size: int,
-) -> Lighting:  # fmt: skip
-    """The light of one image of a mesh; ``lamps`` as in ``Lighting``.
-
-    Shadow maps, if requested, tell how near to a lamp the nearest surface is, seen along its light.
-    """
-    centre = (translation + np.array([0, 0, 1], np.float32)).astype(np.float32)
-    none = np.zeros((0, 0, 0), np.float32)
-    across = np.zeros((len(lamps), 2, 3), np.float32)
-    lighting = Lighting(np.float32(ambient), lamps, gloss, haze, across, centre, none)
-    if not shadows:
-        return lighting
-    points = mesh.vertices @ rotation.T
-    size = TEXELS * image_size
+def _cast_shadows(
+    mesh: TriangleMesh, rotation: ndarray, translation: Float32[ndarray, "3"], light: Lighting
+) -> None:
+    """Fill in the shadow maps: how near to each lamp the nearest surface is, seen along its light."""
+    points, size = mesh.vertices @ rotation.T, light.maps.shape[-1]
     scale = 0.48 * size / max(float(np.linalg.norm(points, axis=1).max()), 1e-6)
-    maps = np.zeros((len(lamps), size, size), np.float32)
-    for number, lamp in enumerate(lamps):
-        across[number] = scale * axes_about(lamp[1:].astype(float))
+    light.centre[:] = translation + np.array([0, 0, 1], np.float32)
+    more, holes = np.zeros((len(points), 8), np.float32), np.zeros((0, 2, 3), np.float32)
+    for lamp, across, nearest in zip(light.lamps, light.across, light.maps, strict=True):
+        across[:] = scale * axes_about(lamp[1:].astype(float))
         places = np.empty((len(points), 3), np.float32)
-        places[:, :2] = points @ across[number].T + 0.5 * (size - 1)
+        places[:, :2] = points @ across.T + 0.5 * (size - 1)
         places[:, 2] = 1 - points @ lamp[1:]
-        more, holes = np.zeros((len(points), 8), np.float32), np.zeros((0, 2, 3), np.float32)
-        owner = np.empty(maps[number].shape, np.int32)
-        fill_triangles(places, mesh.triangles, mesh.number[:0], more, holes, maps[number], owner)
-    return lighting._replace(maps=maps)
+        owner = np.empty(nearest.shape, np.int32)
+        fill_triangles(places, mesh.triangles, mesh.number[:0], more, holes, nearest, owner)

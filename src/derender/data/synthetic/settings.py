@@ -16,6 +16,7 @@ import yaml
 from numpy import ndarray
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from derender.data.synthetic.lighting import Lighting, lighting
 from derender.overrides import with_changes
 from derender.settings import Settings
 from derender.storage.places import require_known
@@ -173,12 +174,11 @@ class EffectSettings(Settings):
         return self.shadows or self.lamps > 1 or self.gloss[1] > 0 or self.haze[1] > 0
 
     def draw(
-        self, generator: np.random.Generator, strength: float
-    ) -> tuple[ndarray, ndarray, ndarray, dict[str, Any]]:
-        """Gloss and haze of one image as in ``lighting.Lighting``, further lamps (K, 4), and labels of all.
+        self, generator: np.random.Generator, ambient: np.float32, lamp: ndarray, turn: ndarray, size: int
+    ) -> tuple[Lighting, dict[str, Any]]:
+        """The light of one image, and labels of what it has beyond its first ``lamp`` (4,).
 
-        A lamp is its strength, and a unit direction in the canonical frame. ``strength`` is that of the first
-        lamp. Settings change no other draw.
+        ``turn`` takes directions from the canonical to the camera's frame; settings change no other draw.
         """
         share, lamps = generator.random(4), generator.random((3, 3))
         gloss = np.array([drawn(self.gloss, share[0]), _even_in_log(self.exponent, share[1])], np.float32)
@@ -187,7 +187,7 @@ class EffectSettings(Settings):
         pitch, yaw = np.deg2rad(self.lamp_deg) * (2 * lamps[:, 1:].T - 1)
         rows = np.stack([np.tan(yaw), np.tan(pitch), np.ones_like(yaw)], axis=1)
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        power = strength * (0.3 + 0.7 * lamps[:, :1])
+        power = lamp[0] * (0.3 + 0.7 * lamps[:, :1])
         labels: dict[str, Any] = {}
         if self.gloss[1] > 0:
             labels |= {"gloss_strength": gloss[0], "gloss_exponent": gloss[1]}
@@ -196,7 +196,8 @@ class EffectSettings(Settings):
         angles = np.rad2deg(np.stack([pitch, yaw], axis=1)).astype(np.float32)
         for n, (force, own) in enumerate(zip(power[:, 0].astype(np.float32), angles, strict=True), 2):
             labels |= {f"lamp{n}": force, f"lamp{n}_pitch": own[0], f"lamp{n}_yaw": own[1]}
-        return gloss, haze, np.hstack([power, rows]), labels
+        every = np.vstack([lamp, np.hstack([power, rows @ turn.T])])
+        return lighting(ambient, every, gloss, haze, size if self.shadows else 0), labels
 
 
 def _even_in_log(ends: Range, share: float) -> float:

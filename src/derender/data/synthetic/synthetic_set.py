@@ -23,7 +23,7 @@ from PIL import Image
 
 from derender.data.stream import Progress
 from derender.data.synthetic.lighting import EFFECTS
-from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh, lit_by
+from derender.data.synthetic.mesh_image import ImageMaps, TriangleMesh, draw_mesh
 from derender.data.synthetic.settings import EffectSettings
 from derender.scene.camera import focal_px, rotation_matrix
 from derender.scene.light import light_direction
@@ -113,13 +113,10 @@ def make_set(
         for index, shot in zip(indices, shots(indices), strict=True):
             (rotation,), (direction,) = camera_rotation_and_light(shot.camera[None], shot.light[None])
             turn, shift, (ambient, diffuse) = rotation.astype(np.float32), shot.camera[3:], shot.light[:2]
-            generator = np.random.default_rng([seed, 5, index])
-            gloss, haze, more, labels = effects.draw(generator, float(diffuse))
-            further = np.hstack([more[:, :1], more[:, 1:] @ turn.T])
-            lamps = np.vstack([[diffuse, *direction], further]).astype(np.float32)
-            lit = (float(ambient), lamps, gloss, haze, effects.shadows, image_size)
-            lighting, out = lit_by(shot.mesh, turn, shift, *lit), ImageMaps(*(m[index - first] for m in maps))
-            draw_mesh(shot.mesh, turn, shift, lighting, shot.background, focal, out)
+            generator, lamp = np.random.default_rng([seed, 5, index]), np.array([diffuse, *direction])
+            light, labels = effects.draw(generator, ambient, lamp, turn, image_size)
+            out = ImageMaps(*(m[index - first] for m in maps))
+            draw_mesh(shot.mesh, turn, shift, light, shot.background, focal, out)
             rows.append((*shot[2:5], shot.labels | labels, shot.traits))  # without meshes
         return rows
 
