@@ -16,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
-    "data": (7_130, 30),
+    "data": (6_965, 30),
     "evaluation": (7_310, 32),  # ridge regression in closed form
     "report": (4_000, 25),  # images that do not suit a model are left out
     "cli": (2_291, 32),  # the same
