@@ -11,7 +11,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy,
 import derender
 from derender.data import ImageSet
 from derender.evaluation import finetuning
-from derender.evaluation.finetuning import FinetuneStep, FinetuneTask, load_finetuned, target_of
+from derender.evaluation.finetuning import FinetuneTask, load_finetuned, target_of
 from derender.evaluation.linear_probes import head_loss
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
@@ -20,7 +20,7 @@ from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import PRESETS, FinetuneConfig, with_changes
 from derender.training.loop import train_task
 from derender.training.run_folder import RunFolder, read_metrics
-from derender.training.task import compute_step, network_precision
+from derender.training.task import Step, compute_step, network_precision
 
 TINY = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=8", "patience=99"]
 TINY += ["validate_every=32", "checkpoint_every=32", "deterministic=true", "watch=false", "warmup_images=0"]
@@ -62,7 +62,7 @@ def test_both_objectives_reach_the_encoders(pictures, tmp_path):
         one = task(pictures, target__weight=weight, target__rendering_weight=rendering)
         model = one.build()
         nothing = torch.zeros(0, 3, 32, 32, dtype=torch.uint8)
-        module = one.step_module(model, RunFolder(tmp_path), nothing, lambda *at: None)
+        module = Step(model, one.losses(model, RunFolder(tmp_path), nothing, lambda *at: None))
         rows = one.target.split.train[:8]
         images = torch.from_numpy(pictures.images[rows]).float() / 255
         precision = network_precision("32-true", torch.device("cpu"))
@@ -200,7 +200,7 @@ def test_bad_input_is_named_before_a_folder_is_made(pictures, tmp_path):
 
 
 def test_every_batch_of_the_loop_gets_its_labels(pictures, tmp_path, monkeypatch):
-    forward, seen = FinetuneStep.forward, set()
+    forward, seen = Step.forward, set()
 
     def noted(step, images, generator, precision, done=None, rows=None):
         for image, row in zip((images * 255).round().byte().numpy(), rows.tolist(), strict=True):
@@ -209,7 +209,7 @@ def test_every_batch_of_the_loop_gets_its_labels(pictures, tmp_path, monkeypatch
             seen.add(row)
         return forward(step, images, generator, precision, done, rows)
 
-    monkeypatch.setattr(FinetuneStep, "forward", noted)
+    monkeypatch.setattr(Step, "forward", noted)
     one = task(pictures, "images=48", "rendering_weight=0")
     train_task(one, pictures, tmp_path / "run")
     assert seen == {*one.target.split.train.tolist(), *one.target.split.validation.tolist()}

@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,9 +13,10 @@ from derender.objectives.reconstruction import masked_l1, photometric_loss
 from derender.objectives.self_features import SelfFeatures
 from derender.render import render_scene
 from derender.training.config import ObjectiveSettings, TrainConfig, resolve
-from derender.training.derender_task import DerenderStep
+from derender.training.derender_task import DerenderTask
+from derender.training.run_folder import RunFolder
 from derender.training.step import cycle_loss, fill_uncovered, own_share, perturb_one_factor, training_step
-from derender.training.task import compute_step
+from derender.training.task import Step, compute_step
 
 TEMPLATE = ObjectiveSettings(perceptual="none", curvature_weight=0.0, template_share=0.1, release_share=0.2)
 PLAIN = ObjectiveSettings(perceptual="none", curvature_weight=0.0)
@@ -124,7 +126,10 @@ def test_a_shared_template_leaves_cameras_and_lights_their_own(model, images, ge
 
 
 def test_the_step_follows_the_run_and_validation_does_not(model, images, generator):
-    module = DerenderStep(model, TrainConfig(objective=TEMPLATE), None)
+    task = DerenderTask(TrainConfig(objective=TEMPLATE))
+    module = Step(
+        model, task.losses(model, RunFolder(Path()), torch.zeros(0, 3, 32, 32, dtype=torch.uint8), print)
+    )
 
     def depth(done):
         return compute_step(module, images, generator, nullcontext, done).scene.depth

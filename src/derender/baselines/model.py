@@ -218,33 +218,22 @@ class BaselineTask(loop.TrainingTask):
             torch.manual_seed(self.config.seed)
             return network_type(self.config.baseline).build(self.config)
 
-    def step_module(
-        self, model: nn.Module, run: run_folder.RunFolder, images: UInt8[Tensor, "n 3 h w"],
+    def losses(
+        self, model: LoopModel, run: run_folder.RunFolder, images: UInt8[Tensor, "n 3 h w"],
         progress: loop.PhaseProgress,
-    ) -> "BaselineStep":  # fmt: skip
-        aid = network_type(self.config.baseline).prepare(self.config, images, run.perceptual, progress)
-        return BaselineStep(model, self.config, aid)
+    ) -> loop.Losses:  # fmt: skip
+        aid = model.prepare(self.config, images, run.perceptual, progress)
+
+        def step(batch: Tensor, generator: Generator, precision: loop.Precision, *_: Any) -> loop.StepLosses:
+            terms = model.losses(batch, LossInputs(self.config, generator, precision, aid))
+            total = torch.stack([term for name, term in terms.items() if name not in OUTSIDE_LOSS]).sum()
+            return loop.StepLosses(total, {name: term.detach() for name, term in terms.items()})
+
+        return step
 
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
         """Stops a run whose loss is NaN or infinite."""
         return FiniteWatch()
-
-
-class BaselineStep(nn.Module):
-    """A baseline and its losses; a batch goes in, the total and the result come out."""
-
-    def __init__(self, model: nn.Module, config: Any, aid: Any):
-        super().__init__()
-        self.model, self.config = model, config
-        self.aid = [aid]  # in a list: its weights are not this module's
-
-    def forward(
-        self, images: Tensor, generator: Generator, precision: loop.Precision, *_: Any
-    ) -> tuple[Tensor, loop.Held]:
-        assert isinstance(self.model, LoopModel)
-        terms = self.model.losses(images, LossInputs(self.config, generator, precision, self.aid[0]))
-        total = torch.stack([term for name, term in terms.items() if name not in OUTSIDE_LOSS]).sum()
-        return total, loop.Held(loop.StepLosses(total, {name: term.detach() for name, term in terms.items()}))
 
 
 class ShortRun:

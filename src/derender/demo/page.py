@@ -33,12 +33,6 @@ from derender.training.run_folder import read_metrics
 
 CLUSTERS_SHOWN, MEMBERS_SHOWN, INPUTS_SHOWN, BUNDLED_SHOWN = 5, 12, 10, 4
 COLUMNS_BESIDE = ("reconstruction", "normals", "albedo", "another view")
-ENDED = {
-    "images": "the planned number of images",
-    "minutes": "the time limit",
-    "patience": "no more improvement on held-out images",
-    "collapse": "the watcher",
-}
 Pixels = UInt8[np.ndarray, "n 3 h w"]
 
 
@@ -58,12 +52,6 @@ def demo_page(result: DemoResult) -> Page:
         "result": result,
         "usual": PRESETS[result.config.preset].images,
         "tables": tables,
-        "verdicts": {
-            "Depth": tables["geometry"].verdict(0),
-            "Normals": tables["geometry"].verdict(1),
-            "Identity": tables["clustering"].verdict(0),
-            "Reconstruction": tables["reconstruction"].verdict(0),
-        },
         "tile": _tile,
         "inputs": colours.pictures(result.seen.images[::step][:INPUTS_SHOWN]),
         "names": names,
@@ -82,7 +70,8 @@ def demo_page(result: DemoResult) -> Page:
         "people": len(np.unique(result.identities)),
         "clusters": _clusters(result),
         "charts": loss_charts(read_metrics(result.trained.folder)),
-        "training": _training(result),
+        "stages": [stage for stage in STAGES if stage in result.seconds],
+        "threads": torch.get_num_threads(),
         "presets": ", ".join(MODEL_PRESETS),
     }
     return Page(
@@ -168,17 +157,3 @@ def _clusters(result: DemoResult) -> list[tuple[list[Any], str]]:
         row = [(face, f"a face of {name}", name) for face, name in zip(faces, names, strict=True)]
         shown.append((row, f"{len(members)} images, {100 * purity:.0f} % of one person"))
     return shown
-
-
-def _training(result: DemoResult) -> dict[str, object]:
-    trained = result.trained
-    return {
-        **{stage: f"{result.seconds[stage]:.0f} s" for stage in STAGES if stage in result.seconds},
-        "images seen": f"{trained.images:,}",
-        "images per second": f"{trained.images_per_second:.0f}",
-        "training ended by": ENDED.get(trained.stopped, trained.stopped),
-        "preset": result.config.preset,
-        "perceptual features": result.config.objective.perceptual,
-        "seed": result.seed,
-        "threads": torch.get_num_threads(),
-    }

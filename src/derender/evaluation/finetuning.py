@@ -35,17 +35,15 @@ from derender.evaluation.score_table import Scores, scored_table, verdict
 from derender.features import map_batches, model_fingerprint, named
 from derender.inputs import Progress
 from derender.model import Derenderer, load
-from derender.objectives.perceptual import PerceptualFeatures
 from derender.storage.atomic import atomic_file, new_folder
 from derender.storage.bounded import read_json
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.config import FinetuneConfig
-from derender.training.derender_task import DerenderTask, perceptual_of
+from derender.training.derender_task import DerenderTask
 from derender.training.loop import NOT_RECONSTRUCTION
 from derender.training.run_folder import RunFolder
-from derender.training.step import own_share, training_step
-from derender.training.task import Held, PhaseProgress, Precision, StepLosses, TrainingTask
-from derender.training.watch import FiniteWatch, Watcher
+from derender.training.task import Losses, PhaseProgress, Precision, StepLosses, TrainingTask
+from derender.training.watch import FiniteWatch
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
 BOTH = ("accuracy", "balanced_accuracy")
@@ -195,64 +193,46 @@ class FinetuneTask(TrainingTask):
             head = TargetHead(factors, width, asked.kind, asked.names)
         return FinetunedModel(model.cpu(), head).requires_grad_(True).train()
 
-    def step_module(
-        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-    ) -> "FinetuneStep":
-        """The step, with all labels, and with the perceptual features of the run that it starts from."""
-        assert isinstance(model, FinetunedModel)
-        config, perceptual = self.config, None
-        if config.target.rendering_weight > 0:
+    def losses(
+        self, model: FinetunedModel, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+    ) -> Losses:
+        """Both objectives, with the perceptual features of the run that this one starts from."""
+        config, target, head = self.config, self.config.target, model.head
+        rendering: Losses | None = None
+        if target.rendering_weight > 0:
             if config.start is not None and config.objective.perceptual == "self":
                 there = RunFolder(Path(config.start)).perceptual  # its sigmas belong to them
                 if there.is_file() and not run.perceptual.exists():
                     with atomic_file(run.perceptual) as temporary:
                         shutil.copyfile(there, temporary)
-            perceptual = perceptual_of(config, run, images, progress)
-        labels = torch.from_numpy(self.target.visible).float().to(images.device)
-        return FinetuneStep(model, config, labels, perceptual)
+            rendering = DerenderTask(config).losses(model.model, run, images, progress)
+        known = torch.from_numpy(self.target.visible).float().to(images.device)
+
+        def step(
+            batch: Tensor, generator: Generator, precision: Precision, done: float | None, rows: Tensor
+        ) -> StepLosses:
+            if rendering is None:
+                with precision():
+                    codes = model.model.encode(batch)
+                result = StepLosses(batch.new_zeros(()), {})
+            else:
+                shared = None if config.start is not None else done  # of a trained model no map is shared
+                result: Any = rendering(batch, generator, precision, shared)
+                codes = result.codes
+            weight = target.rendering_weight
+            terms = {name: value if name == "l1" else weight * value for name, value in result.terms.items()}
+            labels = known[rows.to(known.device, non_blocking=True)]
+            loss = target.weight * head_loss(head(codes)[None], labels[None], head.kind)[0]
+            terms["target"] = loss.detach()
+            return replace(result, total=weight * result.total + loss, terms=terms)
+
+        return step
 
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
         """The collapse detector; where nothing is rendered, a watcher of the loss."""
         if self.config.target.rendering_weight == 0:
             return FiniteWatch()
-        return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory)
-
-
-class FinetuneStep(nn.Module):
-    """Model, head and both objectives; a batch goes in, the total and the result come out.
-
-    ``labels`` (N, A) are those of the whole data set: -1 (unknown), 0 or 1.
-    """
-
-    def __init__(
-        self, model: FinetunedModel, config: FinetuneConfig, labels: Float[Tensor, "n a"],
-        perceptual: PerceptualFeatures | None,
-    ):  # fmt: skip
-        super().__init__()
-        self.model, self.config, self.labels, self.perceptual = model, config, labels, perceptual
-
-    def forward(
-        self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None,
-        rows: Tensor | None = None,
-    ) -> tuple[Tensor, Held]:  # fmt: skip
-        assert rows is not None
-        config, target, head = self.config, self.config.target, self.model.head
-        if target.rendering_weight == 0:
-            with precision():
-                codes = self.model.model.encode(images)
-            result = StepLosses(images.new_zeros(()), {})
-        else:
-            own = 1.0 if done is None or config.start is not None else own_share(config.objective, done)
-            result = training_step(
-                self.model.model, images, config.objective, self.perceptual, generator, precision, own
-            )
-            codes = result.codes
-        weight = target.rendering_weight
-        terms = {name: value if name == "l1" else weight * value for name, value in result.terms.items()}
-        labels = self.labels[rows.to(self.labels.device, non_blocking=True)]
-        loss = target.weight * head_loss(head(codes)[None], labels[None], head.kind)[0]
-        total = weight * result.total + loss
-        return total, Held(replace(result, total=total, terms={**terms, "target": loss.detach()}))
+        return DerenderTask(self.config).watch(memory)
 
 
 def score_finetuned(

@@ -83,7 +83,7 @@ def refine(
     fitting (`whiten` makes one); settings are changes of `RefineConfig`, as ``{"refining.images": 9000}``.
 
     Returns:
-        The copy; "held_out" is the number of held-out images, "errors" and "gaps" are those of `Refined`.
+        The copy; "held_out" is the number of held-out images, "errors" and "gaps" are those of `Student`.
     """
     config = copy_settings("refine", settings)
     work = _Copying(model, images, Path(out), 10, **how)
@@ -105,7 +105,7 @@ def unet(
     Arguments are those of `whiten`; settings are changes of `UNetSettings`, as ``{"images": 50_000}``.
 
     Returns:
-        The copy; "errors" are those of `DistilledUNets`.
+        The copy; "errors" are those of `distil_unets`.
     """
     config = copy_settings("unet", settings)
     work = _Copying(model, images, Path(out), 2, **how)

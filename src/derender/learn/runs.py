@@ -130,9 +130,9 @@ def train(
     return result
 
 
-def texts_of(settings: Changes) -> list[str]:
+def texts_of(settings: Changes | None) -> list[str]:
     """As ``key=value`` texts."""
-    return as_overrides(settings) if isinstance(settings, Mapping) else list(settings)
+    return as_overrides(settings) if isinstance(settings, Mapping) else list(settings or ())
 
 
 @dataclass(frozen=True)
@@ -144,29 +144,31 @@ class Finetuned:
     start: str | None
 
 
-_TARGET = ("labels", "factors", "weight", "rendering_weight", "labelled")
-
-
 def finetune_settings(
     out: str | Path, *, model: str | Path | None = None, preset: str | None = None,
     labels: Sequence[str] | None = None, attributes: bool = False,
     factors: Sequence[str] | str | None = None, weight: float | None = None,
-    rendering_weight: float | None = None, labelled: int | None = None, settings: Changes | None = None,
+    rendering_weight: float | None = None, labelled: int | None = None, settings: Changes | None = (),
     resume: bool = False,
 ) -> FinetuneConfig:  # fmt: skip
     """The settings of a joint training; arguments as for `finetune`."""
-    names = locals()
+    if isinstance(factors, str):
+        factors = [name.strip() for name in factors.split(",")]
+    target = {
+        "labels": list(dict.fromkeys(labels or ())) or None, "factors": factors, "weight": weight,
+        "rendering_weight": rendering_weight, "labelled": labelled,
+    }  # fmt: skip
+    changes = {name: {f"target__{name}": value} for name, value in target.items() if value is not None}
     if resume:
         if not (Path(out) / "config.yaml").is_file():
             raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): begin without resume")
         config = read_any_config(Path(out))
         if not isinstance(config, FinetuneConfig):
             raise ValueError(f"{out} was made by derender train: continue with derender train --resume")
-        start = {"model": config.start, "preset": None if config.start else config.preset}
-        differ = [key for key, value in start.items() if names[key] is not None and str(names[key]) != value]
-        given = [(key, {key: names[key]}) for key in _TARGET if names[key] is not None]
-        given += [(text, {"settings": [text]}) for text in texts_of(settings or ())]
-        differ += [key for key, change in given if _changed(config, **change) != config]
+        began = {"model": (model, config.start), "preset": (preset, None if config.start else config.preset)}
+        differ = [name for name, (given, own) in began.items() if given is not None and str(given) != own]
+        differ += [name for name, change in changes.items() if with_changes(config, **change) != config]
+        differ += [text for text in texts_of(settings) if with_changes(config, [text]) != config]
         if differ:
             raise ValueError(f"a resumed run keeps its settings: leave out {', '.join(differ)}")
         return config
@@ -183,22 +185,8 @@ def finetune_settings(
         values = config.model_dump(mode="json", include=kept)
         start = as_model(model, device="cpu")
         config = FinetuneConfig(**values, model=start.settings, start=str(model))
-    given = {key: names[key] for key in _TARGET}
-    return _changed(config, settings=settings or (), **given)
-
-
-def _changed(
-    config: FinetuneConfig, *, labels: Sequence[str] | None = None,
-    factors: Sequence[str] | str | None = None, settings: Changes = (), **target: float | None,
-) -> FinetuneConfig:  # fmt: skip
-    """A configuration with settings, then options, changed."""
-    if isinstance(factors, str):
-        factors = [name.strip() for name in factors.split(",")]
-    return with_changes(
-        config, texts_of(settings), target__labels=list(dict.fromkeys(labels or ())) or None,
-        target__factors=None if factors is None else list(factors),
-        **{f"target__{key}": value for key, value in target.items()},
-    )  # fmt: skip
+    every = {key: value for change in changes.values() for key, value in change.items()}
+    return with_changes(config, texts_of(settings), **every)
 
 
 def finetune(

@@ -52,8 +52,15 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
     config = read_any_config(run.path)
     metrics, environment = read_metrics(run.path), recorded_environment(run.path)
     settings = settings_by_name(config.model_dump(mode="json"))
+    validated = _finite_rows(metrics, "loss", "validation")
+    broken = [row for row in metrics if any(isinstance(v, float) and not isfinite(v) for v in row.values())]
     values = {
-        "facts": _facts(metrics, config),
+        "last": metrics[-1] if metrics else None,
+        "speeds": [row["images_per_second"] for row in _finite_rows(metrics, "images_per_second")],
+        "best": min(validated, key=lambda row: row["loss"], default=None),
+        "planned": getattr(config, "images", 0),
+        "saved": run.model.exists(),
+        "broken": len(broken),
         "watcher": [
             str(text)
             for row in metrics
@@ -63,7 +70,7 @@ def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
         "charts": loss_charts(metrics),
         "samples": samples,
         "evidence": evidence,
-        "failures": [*_failures(run, config, metrics), *unread],
+        "unread": unread,
         "settings": settings,
         "environment": environment,
     }
@@ -83,39 +90,11 @@ def loss_charts(metrics: Metrics) -> list[tuple[str, str, str]]:
     for key, (label, text) in CHARTS.items():
         series = {}
         for kind, name in (("train", "training"), ("validation", "held out")):
-            if rows := [row for row in metrics if row.get("kind") == kind and _finite(row.get(key))]:
+            if rows := _finite_rows(metrics, key, kind):
                 series[name] = ([row["images"] for row in rows], [row[key] for row in rows])
         if any(len(x) > 1 for x, _ in series.values()):  # one point is no curve
             made.append((charts.curves(series, "images seen", label), f"{label} over images seen", text))
     return made
-
-
-def _facts(metrics: Metrics, config: Any) -> dict[str, str]:
-    if not metrics:
-        return {}
-    last = metrics[-1]
-    facts = {"images seen": f"{last['images']:,}", "minutes": f"{last.get('seconds', 0) / 60:.1f}"}
-    speeds = [row["images_per_second"] for row in metrics if _finite(row.get("images_per_second"))]
-    if speeds:
-        facts["images per second"] = f"{speeds[-1]:.0f}"
-    validated = [row for row in metrics if row.get("kind") == "validation" and _finite(row.get("loss"))]
-    if validated and getattr(config, "keep", None) == "best":
-        best = min(validated, key=lambda row: row["loss"])
-        facts["weights of the model"] = f"after {best['images']:,} images, the best on held-out ones"
-    return facts
-
-
-def _failures(run: RunFolder, config: Any, metrics: Metrics) -> list[str]:
-    """Sentences on everything that was cut short or is no number."""
-    lines = []
-    seen, planned = (metrics[-1]["images"] if metrics else 0), getattr(config, "images", 0)
-    if seen < planned:
-        why = "the run was stopped (time limit, patience, watcher or Ctrl-C), or is running."
-        lines.append(f"{seen:,} of {planned:,} planned images were seen: {why}")
-    if not run.model.exists():
-        lines.append("There is no saved model: no validation was reached.")
-    rows = sum(1 for row in metrics if any(isinstance(v, float) and not isfinite(v) for v in row.values()))
-    return [*lines, f"{rows:,} logged rows hold NaN or infinity."] if rows else lines
 
 
 def _samples(run: RunFolder) -> tuple[list[tuple[bytes, str]], list[str]]:
@@ -136,5 +115,7 @@ def _samples(run: RunFolder) -> tuple[list[tuple[bytes, str]], list[str]]:
     return made, unread
 
 
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float) and isfinite(value)
+def _finite_rows(metrics: Metrics, name: str, kind: str | None = None) -> Metrics:
+    """Rows, of one kind or any, in which this is a number."""
+    some = (row for row in metrics if kind in (None, row.get("kind")))
+    return [row for row in some if isinstance(row.get(name), int | float) and isfinite(row[name])]

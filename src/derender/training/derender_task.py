@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor
 
 from derender.data import ImageSet, split_indices
 from derender.model import Derenderer, load
@@ -29,8 +29,8 @@ from derender.training.held_out_errors import store_errors
 from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, train_task
 from derender.training.process import deterministic_algorithms, locked
 from derender.training.run_folder import RunFolder
-from derender.training.step import own_share, training_step
-from derender.training.task import Held, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
+from derender.training.step import StepResult, own_share, training_step
+from derender.training.task import Losses, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
 from derender.training.watch import Watcher
 
 
@@ -119,37 +119,28 @@ class DerenderTask(TrainingTask):
                 raise ValueError(f"cannot start from {start}: {why}") from error
         return model.with_features(Features(self.whitening))
 
-    def step_module(
-        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-    ) -> "DerenderStep":
-        """The step with the run's perceptual features, learnt first where there are none yet."""
-        assert isinstance(model, Derenderer)
-        return DerenderStep(model, self.config, perceptual_of(self.config, run, images, progress), self.ranks)
+    def losses(
+        self, model: Derenderer, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+    ) -> Losses:
+        """Those of `training_step`; perceptual features are learnt first where the run has none yet.
+
+        Held-out images are each judged by one of the ``ranks``.
+        """
+        objective, chunks = self.config.objective, self.config.accumulate
+        perceptual = perceptual_of(self.config, run, images, progress)
+
+        def step(
+            batch: Tensor, generator: Generator, precision: Precision, done: float | None = None, *_: Any
+        ) -> StepResult:
+            own, ranks = (1.0, ALONE) if done is None else (own_share(objective, done), self.ranks)
+            how = generator, precision, own, ranks, chunks
+            return training_step(model, batch, objective, perceptual, *how)
+
+        return step
 
     def watch(self, memory: dict[str, Any]) -> Watcher:
         """The collapse detector."""
         return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory, self.ranks)
-
-
-class DerenderStep(nn.Module):
-    """Model, objective and perceptual features; held-out images are each judged by one of the ``ranks``."""
-
-    def __init__(
-        self, model: Derenderer, config: TrainConfig, perceptual: PerceptualFeatures | None,
-        ranks: Ranks = ALONE,
-    ):  # fmt: skip
-        super().__init__()
-        self.model, self.config, self.perceptual, self.ranks = model, config, perceptual, ranks
-
-    def forward(
-        self, images: Tensor, generator: Generator, precision: Precision, done: float | None = None,
-        rows: Tensor | None = None,
-    ) -> tuple[Tensor, Held]:  # fmt: skip
-        objective, chunks = self.config.objective, self.config.accumulate
-        own, ranks = (1.0, ALONE) if done is None else (own_share(objective, done), self.ranks)
-        how = generator, precision, own, ranks, chunks
-        result = training_step(self.model, images, objective, self.perceptual, *how)
-        return result.total, Held(result)
 
 
 def self_features_of(

@@ -12,7 +12,7 @@ as the model predicts them. Leaves out the confidence net, which stays.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -93,25 +93,23 @@ class RefineConfig(FeatureSettings):
 
 
 @dataclass(frozen=True)
-class Refined:
-    """The student, in evaluation mode, with features, and how it does on held-out images.
-
-    ``errors`` "before", "now" and "fitted" are the mean masked L1 (0..1) of reconstructions. ``gaps``, by
-    parameter of a scene, are how far predictions lie from fitted scenes, "before" and "now", in mean
-    deviations.
-    """
+class Student:
+    """A copy of a model that learned from it, in evaluation mode, and its errors and gaps by name."""
 
     model: Derenderer
     errors: dict[str, float]
-    gaps: dict[str, dict[str, float]]
+    gaps: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 def refine(
     model: Derenderer, images: UInt8[Tensor, "n 3 h w"], held_out: UInt8[Tensor, "m 3 h w"],
     config: RefineConfig | None = None, *, seed: int = 0, progress: Progress | None = None,
-) -> Refined:  # fmt: skip
+) -> Student:  # fmt: skip
     """A copy of a trained model that predicts what fitting finds; the model stays as it is.
 
+    ``errors`` "before", "now" and "fitted" are the mean masked L1 (0..1) of reconstructions. ``gaps``, by
+    parameter of a scene, are how far predictions lie from fitted scenes, "before" and "now", in mean
+    deviations.
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
     neither read nor changed. Errors are measured on ``held_out`` images. A ValueError: a model that cannot
     fit scenes; too few images, or of another size; weights that end up not finite.
@@ -140,7 +138,7 @@ def refine(
     fitting = config.fitting.model_copy(update={"coordinates": maps.size("depth")})
     features = config.model_copy(update={"fitting": fitting})
     student = make_features(student, images, features, seed=seed, progress=progress, maps=maps)
-    return Refined(student, *_compared(model, student, held_out[:MEASURED_IMAGES], settings.fit_steps))
+    return Student(student, *_compared(model, student, held_out[:MEASURED_IMAGES], settings.fit_steps))
 
 
 @dataclass(frozen=True)
@@ -311,7 +309,7 @@ def _mean_deviation(value: Float[Tensor, "n ..."], numbers: Sequence[Number] = (
 def _compared(
     model: Derenderer, student: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Errors and gaps of ``Refined``."""
+    """Errors and gaps of a refined model."""
     model, student = model.with_brightness(None), student.with_brightness(None)
     shown = as_float(images).to(model.device)
     fitted = model.fit_scenes(shown, steps).scene

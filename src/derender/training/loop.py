@@ -30,6 +30,7 @@ from derender.training.cuda_graph import Replayed
 from derender.training.distributed import open_fabric, ranks_of
 from derender.training.task import (
     Progress,
+    Step,
     StepLosses,
     TrainingTask,
     TrainResult,
@@ -89,12 +90,12 @@ class _Run:
             self.model.to(memory_format=torch.channels_last)
         phase = Progress.of("perceptual", self.report)
         with fabric.rank_zero_first():
-            step = task.step_module(self.model, self.folder, batches.sample(), phase)
+            losses = task.losses(self.model, self.folder, batches.sample(), phase)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
         on_gpu = fabric.device.type == "cuda"
         self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True, capturable=on_gpu)
-        self.module = fabric.setup_module(step)
+        self.module = fabric.setup_module(Step(self.model, losses))
         self.precision = network_precision(config.precision, fabric.device)
         held_out = split.validation[:MAX_VALIDATION_IMAGES]
         self.held_rows = torch.from_numpy(held_out)

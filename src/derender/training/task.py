@@ -31,11 +31,27 @@ class StepLosses:
     terms: dict[str, Tensor]
 
 
+Losses = Callable[..., StepLosses]
+"""Of one batch, from the arguments of `compute_step` after the module."""
+
+
 class Held:
     """Hides a result from wrappers that walk through a module's output in search of tensors."""
 
     def __init__(self, result: StepLosses):
         self.result = result
+
+
+class Step(nn.Module):
+    """A model with the losses of its batches, as one module that a strategy may wrap."""
+
+    def __init__(self, model: nn.Module, losses: Losses):
+        super().__init__()
+        self.model, self.losses = model, losses
+
+    def forward(self, *batch: Any) -> tuple[Tensor, Held]:
+        result = self.losses(*batch)
+        return result.total, Held(result)
 
 
 class TrainingTask(ABC):
@@ -66,10 +82,10 @@ class TrainingTask(ABC):
         """The untrained model, the same for the same seed; its ``save(folder, overwrite=)`` writes it."""
 
     @abstractmethod
-    def step_module(
-        self, model: nn.Module, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-    ) -> nn.Module:
-        """A module for `compute_step` that returns (total, Held), given all images; ``model`` learns."""
+    def losses(
+        self, model: Any, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+    ) -> Losses:
+        """The losses of a batch, by which ``model`` learns; what they need is made of all images."""
 
     @abstractmethod
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
@@ -80,7 +96,7 @@ def compute_step(
     module: nn.Module, images: Float[Tensor, "n 3 h w"], generator: Generator, precision: Precision,
     done: float | None = None, rows: Int64[Tensor, " n"] | None = None,
 ) -> Any:  # fmt: skip
-    """The losses of one batch through a task's step module, wrapped by a strategy or not.
+    """The losses of one batch through a `Step`, wrapped by a strategy or not.
 
     ``done`` is the share of the run so far, None in evaluation; ``rows`` are images' places in the data set.
     """

@@ -23,7 +23,7 @@ from derender.model import Derenderer
 from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
 from derender.objectives.reconstruction import masked_mean
 from derender.render import warp
-from derender.training.distillation import MEASURED_IMAGES, StudentSettings
+from derender.training.distillation import MEASURED_IMAGES, Student, StudentSettings
 
 ZOOM = (0.7, 1.25)
 SHIFT = 0.15
@@ -57,22 +57,14 @@ class PixelTargets:
     codes: dict[str, Tensor]
 
 
-@dataclass(frozen=True)
-class DistilledUNets:
-    """A model with U-Net encoders and a decoder over both, and how well the encoders learnt."""
-
-    model: Derenderer  # the copy, in evaluation mode and without whitening or fitting
-    # mean absolute error of up to 256 images: "place" (pixels), "depth" (share of the range), "albedo"
-    # (0..1), and "reconstruction" of the copy beside "reconstruction before"
-    errors: dict[str, float]
-
-
 def distil_unets(
     model: Derenderer, images: UInt8[Tensor, "n 3 h w"], settings: UNetSettings | None = None, *,
     seed: int = 0, progress: Progress | None = None,
-) -> DistilledUNets:  # fmt: skip
+) -> Student:  # fmt: skip
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
 
+    It has no whitening or fitting. Its mean absolute errors on up to 256 images are "place" (pixels), "depth"
+    (share of the range), "albedo" (0..1), and "reconstruction" beside "reconstruction before".
     The same seed gives the same weights on the same machine and thread count; torch's global random state is
     neither read nor changed. A ValueError are fewer than two images, images of another size, a grown model,
     one that lacks a factor, and weights of NaN or infinity.
@@ -94,7 +86,7 @@ def distil_unets(
         heads = nn.ModuleDict(decoders).to(model.device)
     _learn(model, student, heads, images, settings, Generator().manual_seed(seed), progress)
     settings.check(student, "the U-Nets' training")
-    return DistilledUNets(student, _errors(model, student, heads, images[:MEASURED_IMAGES]))
+    return Student(student, _errors(model, student, heads, images[:MEASURED_IMAGES]))
 
 
 def _with_unets(model: Derenderer, width: int) -> Derenderer:
@@ -211,7 +203,7 @@ def masked_error(
 def _errors(
     model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: UInt8[Tensor, "n 3 h w"]
 ) -> dict[str, float]:
-    """The errors of ``DistilledUNets``."""
+    """The errors of a copy with U-Nets."""
     shown = as_float(images).to(model.device)
     targets = pixel_targets(model, shown)
     own = {name: heads[name](encoder.skips(shown)) for name, encoder in _encoders(student).items()}
