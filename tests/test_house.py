@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (651, 8),
     "learn": (930, 5),
 }
-TOTAL = (39_469, 243)  # on the way to (37_000, 270)
-TEST_LINES = 26_346
+TOTAL = (39_199, 241)  # on the way to (37_000, 270)
+TEST_LINES = 26_252
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -9,6 +9,7 @@ from PIL import Image
 
 from derender import Derenderer
 from derender.cli import main
+from derender.data.synthetic.faces import generate
 
 TINY = ("image_size=32", "width=4", "light_width=4", "perceptual=none")
 
@@ -40,6 +41,14 @@ def coloured_people(folder: Path, count: int, size: int) -> Path:
         pixels = np.clip(colours[row % 4] + rng.integers(-30, 30, (size, size, 3)), 0, 255).astype(np.uint8)
         (folder / "abcd"[row % 4]).mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(folder / "abcd"[row % 4] / f"{row:03d}.png")
+    return folder
+
+
+def face_files(folder: Path, count: int, seed: int) -> Path:
+    """A folder of so many generated faces of 64 pixels."""
+    folder.mkdir(exist_ok=True)
+    for number, image in enumerate(generate(count, 64, seed=seed).images):
+        Image.fromarray(image.transpose(1, 2, 0)).save(folder / f"{number:03d}.png")
     return folder
 
 

@@ -1,10 +1,11 @@
-"""`evaluate disentangle` and `evaluate geometry`: images drawn, numbers told, bad words refused."""
+"""`evaluate disentangle`, `geometry`, of fitted scenes too: images drawn, numbers told, bad words refused."""
 
 from functools import partial
 from pathlib import Path
 
 import pytest
 from PIL import Image
+from tests.cli.conftest import run
 
 from derender.data.synthetic import faces, write
 from derender.model import Derenderer
@@ -90,3 +91,28 @@ def test_a_rendered_set_of_another_size_is_refused_with_what_to_do(protocol, ren
 def test_brightness_of_photographs_asks_for_groups(model, rendered, refused):
     printed = refused("evaluate", "brightness", "-m", model, "-d", rendered / "images")
     assert "for photographs name a label of groups (--by LABEL)" in printed
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "faces"
+    assert run("synth", "faces", "--out", folder, "--count", "6", "--seed", "3") == 0
+    return folder
+
+
+def asked(kind, made, numbers, *extra) -> dict:
+    given = ["evaluate", kind, "-m", "rendered-faces-64", "-d", made, "--cache", "none", "--resamples", "5"]
+    return numbers(*given, *extra)[0]
+
+
+def test_pictures_are_rendered_better_from_fitted_scenes(made, numbers):
+    read = asked("reconstruction", made, numbers)["reconstruction"]
+    fitted = asked("reconstruction", made, numbers, "--fit-steps", "20")["reconstruction"]
+    assert fitted["model"]["l1"] < 0.95 * read["model"]["l1"]
+    assert fitted["untrained"]["l1"] == pytest.approx(read["untrained"]["l1"])  # is not fitted
+
+
+def test_geometry_of_fitted_scenes_is_another(made, numbers):
+    read = asked("geometry", made, numbers)["geometry"]
+    fitted = asked("geometry", made, numbers, "--fit-steps", "5")["geometry"]
+    assert fitted["model"] != read["model"] and fitted["untrained"] == read["untrained"]

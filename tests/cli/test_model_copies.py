@@ -2,13 +2,11 @@
 
 import pytest
 import torch
-from PIL import Image
+from tests.cli.conftest import face_files, settings
 from tests.cli.conftest import run as call
-from tests.cli.conftest import settings
 
 import derender
 from derender.cli import main
-from derender.data.synthetic import faces
 from derender.storage.places import model_folder
 from derender.training.held_out_errors import read_errors
 
@@ -19,10 +17,7 @@ SHORT = ("images=16", "batch_size=8", "fitted=8", "fit_steps=1", "whitening.pict
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("faces")
-    for index, image in enumerate(faces.generate(200, image_size=64, seed=9).images):
-        Image.fromarray(image.transpose(1, 2, 0)).save(folder / f"{index:03d}.png")
-    return folder
+    return face_files(tmp_path_factory.mktemp("faces"), 200, seed=9)
 
 
 def run(command, folder, out, *pairs, words=(), model=KNOWN) -> int:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from PIL import Image
+from tests.cli.conftest import face_files
 
 from derender.cli import main
 from derender.data.synthetic import faces
@@ -37,10 +37,7 @@ def bytes_of(folder):
 
 
 def test_a_copy_takes_half_the_bytes_and_says_nearly_the_same(unpacked, pictures, tmp_path, capsys):
-    folder = tmp_path / "pictures"
-    folder.mkdir()
-    for index, picture in enumerate(pictures):
-        Image.fromarray(picture.transpose(1, 2, 0)).save(folder / f"{index}.png")
+    folder = face_files(tmp_path / "pictures", 12, seed=4)
     code = main(["pack", "-m", str(unpacked), "-o", str(tmp_path / "p"), "-d", str(folder), "--json", "-"])
     assert code == 0
     printed = json.loads(capsys.readouterr().out)

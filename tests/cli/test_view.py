@@ -9,6 +9,9 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
@@ -92,45 +95,39 @@ def test_what_is_refused(model, photos, refused, tmp_path):
     assert "made by another model" in refused("view", "-m", model, "-f", table)
 
 
-def test_it_answers_until_ctrl_c(model, photos, tmp_path):
-    told = tmp_path / "told.json"
-    words = ["view", "-m", model, str(photos / "1.png"), "--json", str(told)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [sys.executable, "-m", "derender", *words]
-    with subprocess.Popen(command, text=True, cwd=tmp_path, **pipes) as process:
+@contextmanager
+def viewing(told: Path, *words: object) -> Iterator[str]:
+    """The address of a viewer in a process of its own, which at the end is stopped by Ctrl-C and says so."""
+    command = [sys.executable, "-m", "derender", "view", *map(str, words), "--json", str(told)]
+    with subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         try:
-            url = _url(process, told)
-            with urllib.request.urlopen(url, timeout=60) as page:
-                assert b"relight and turn a photograph" in page.read()
-            foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})
-            with pytest.raises(urllib.error.HTTPError, match="421") as answer:
-                urllib.request.urlopen(foreign, timeout=60)
-            answer.value.close()
+            yield _url(process, told)
             process.send_signal(signal.SIGINT)
             _, message = process.communicate(timeout=60)
         finally:
             process.kill()
     assert process.returncode == 0
     assert message.strip() == "stopped"
+
+
+def test_it_answers_until_ctrl_c(model, photos, tmp_path):
+    with viewing(tmp_path / "told.json", "-m", model, photos / "1.png") as url:
+        with urllib.request.urlopen(url, timeout=60) as page:
+            assert b"relight and turn a photograph" in page.read()
+        foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})
+        with pytest.raises(urllib.error.HTTPError, match="421") as answer:
+            urllib.request.urlopen(foreign, timeout=60)
+        answer.value.close()
 
 
 def test_ctrl_c_does_not_wait_for_a_running_fit(photos, tmp_path):
-    told = tmp_path / "told.json"
-    words = ["view", "-m", "rendered-faces-64", str(photos / "1.png"), "--json", str(told)]
-    command = [sys.executable, "-m", "derender", *words, "--fit-steps", "10000"]
-    with subprocess.Popen(command, text=True, stderr=subprocess.PIPE) as process:
-        try:
-            connection = http.client.HTTPConnection(urlsplit(_url(process, told)).netloc, timeout=60)
-            connection.request("POST", "/api/examples/0", headers={"X-Derender-Page": "1"})
-            time.sleep(3)
-            process.send_signal(signal.SIGINT)
-            _, message = process.communicate(timeout=60)
-            assert connection.getresponse().status == 500  # the fit was not waited for
-            connection.close()
-        finally:
-            process.kill()
-    assert process.returncode == 0
-    assert message.strip() == "stopped"
+    words = ("-m", "rendered-faces-64", photos / "1.png", "--fit-steps", 10_000)
+    with viewing(tmp_path / "told.json", *words) as url:
+        connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
+        connection.request("POST", "/api/examples/0", headers={"X-Derender-Page": "1"})
+        time.sleep(3)
+    assert connection.getresponse().status == 500  # the fit was not waited for
+    connection.close()
 
 
 def _url(process: subprocess.Popen, told) -> str:

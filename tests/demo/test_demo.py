@@ -11,11 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
+from tests.cli.conftest import face_files
 
 import derender.demo as package
 from derender.cli import main
-from derender.data.synthetic import faces
 from derender.demo import DemoSettings, demo_page, run_demo, run_own_demo
 from derender.demo.page import score_tables
 from derender.demo.story import STAGES
@@ -104,10 +103,7 @@ def test_command_writes_page_and_numbers(told, html):
 
 
 def test_a_folder_of_ones_own_opens_with_photographs_and_ends_with_its_run(tmp_path):
-    photos, pages = tmp_path / "photos", []
-    photos.mkdir()
-    for row, image in enumerate(faces.generate(24, 64, seed=5).images):
-        Image.fromarray(image.transpose(1, 2, 0)).save(photos / f"{row}.png")
+    photos, pages = face_files(tmp_path / "photos", 24, seed=5), []
     page = run_own_demo(photos, tmp_path / "out", TINY, opened=lambda page: pages.append(page.read_text()))
     assert 'http-equiv="refresh"' in pages[0] and "lit from the left" in pages[0]
     html = page.read_text()

@@ -1,15 +1,12 @@
 """Overlays and tables of an explanation."""
 
 from dataclasses import replace
-from io import BytesIO
 
 import numpy as np
 import torch
-from PIL import Image
 
 from derender.interpretation.attribution import Similarity
 from derender.interpretation.tables import sanity_table, unchanged
-from derender.report.charts import side_by_side
 from derender.report.explanation import overlays
 
 
@@ -37,11 +34,3 @@ def test_the_sanity_table_names_what_not_to_trust():
     values = sanity_table(rows).values()
     assert values["pixels, light"]["changes"] == "no" and values["grad-cam, camera"]["changes"] == "yes"
     assert values["pixels, light"]["other image"] == 0.9
-
-
-def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():
-    svg, png = side_by_side({"light": 0.5}, lambda axes, width: axes.barh([0], [width]), "share", (3, 2))
-    with Image.open(BytesIO(png)) as picture:
-        corner, alpha = picture.convert("RGBA").getpixel((1, 1)), picture.convert("RGBA").getchannel("A")
-    assert corner == (255, 255, 255, 255) and alpha.getextrema() == (255, 255)
-    assert "#ffffff" not in svg and "currentColor" in svg

@@ -3,12 +3,11 @@
 import json
 
 import pytest
-from PIL import Image
+from tests.cli.conftest import face_files
 
 import derender
 from derender.cli import main
 from derender.data import read_images
-from derender.data.synthetic import faces
 from derender.inputs import copy_split, part_of, split_of
 from derender.storage.folder import SplitRecord, read_split, write_split
 from derender.storage.places import SPLIT_FILE
@@ -22,10 +21,7 @@ OTHERS = ('{"format": 2, "shares": [1, 0, 0], "seed": 0}', '{"format": 1, "share
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("faces")
-    for index, picture in enumerate(faces.generate(30, image_size=64, seed=9).images):
-        Image.fromarray(picture.transpose(1, 2, 0)).save(folder / f"{index}.png")
-    return str(folder)
+    return str(face_files(tmp_path_factory.mktemp("faces"), 30, seed=9))
 
 
 @pytest.fixture

@@ -9,10 +9,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
+from tests.cli.conftest import noise
 
 from derender.data import read_images
 from derender.training import resolve, train
@@ -68,12 +67,7 @@ def settings(*changes: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    made = tmp_path_factory.mktemp("pictures")
-    noise = np.random.default_rng(0)
-    for number in range(40):
-        pixels = noise.integers(0, 256, (4, 4, 3), dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
-        Image.fromarray(pixels).save(made / f"{number:03d}.png")
-    return made
+    return noise(tmp_path_factory.mktemp("pictures"), 40)
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tests.training.conftest import noise_set
 
 import derender
 from derender.cli import main
@@ -34,10 +35,7 @@ TINY += ["warmup_images=0", "final_rate=1", "whitening.pictures=0", "fitting.exa
 
 @pytest.fixture(scope="module")
 def pictures() -> ImageSet:
-    noise = np.random.default_rng(0)
-    smooth = noise.integers(0, 256, (60, 3, 4, 4), dtype=np.uint8)
-    images = np.repeat(np.repeat(smooth, 8, axis=2), 8, axis=3)
-    return ImageSet(images=images, files=tuple(f"{i:03d}.png" for i in range(60)), source="made by the test")
+    return noise_set(60, cells=4)
 
 
 def weights(run) -> dict[str, torch.Tensor]:
@@ -169,9 +167,8 @@ def test_the_model_is_of_the_best_validation_and_the_result_says_of_which(worsen
 
 
 def test_the_command_says_of_which_weights_the_model_is(worsening, tmp_path, capsys):
-    made = np.random.default_rng(0).integers(0, 256, (60, 4, 4, 3), dtype=np.uint8).repeat(8, 1).repeat(8, 2)
     (tmp_path / "folder").mkdir()
-    for number, picture in enumerate(made):
+    for number, picture in enumerate(noise_set(60, cells=4).images.transpose(0, 2, 3, 1)):
         Image.fromarray(picture).save(tmp_path / "folder" / f"{number:03d}.png")
     told = [part for setting in [*WORSENING, "split=[0.8,0.2,0]"] for part in ("--set", setting)]
     told += ["--preset", "small", "--data", str(tmp_path / "folder"), "--out", str(tmp_path / "run")]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from tests.training.conftest import noise_set
 from torch.nn.functional import avg_pool2d
 
 import derender
@@ -28,8 +29,7 @@ BRIEF += ["final_rate=1", "deterministic=true", "whitening.pictures=0", "fitting
 
 @pytest.fixture(scope="module")
 def pictures() -> ImageSet:
-    images = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)
-    return ImageSet(images=images, files=tuple(f"{i:03d}.png" for i in range(40)), source="made by the test")
+    return noise_set(40)
 
 
 @pytest.fixture

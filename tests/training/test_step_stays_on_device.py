@@ -4,13 +4,12 @@ Either would stop the device in every step, and neither can be part of a CUDA gr
 the same calls are made.
 """
 
-import numpy as np
 import pytest
 import torch
+from tests.training.conftest import noise_set
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from derender.data import ImageSet
 from derender.model import Derenderer
 from derender.objectives.perceptual import Vgg16Features
 from derender.training import loop, train
@@ -77,10 +76,8 @@ def test_the_loop_reads_the_notes_of_many_steps_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(loop._Run, "step", watched)
     monkeypatch.setattr(loop._Run, "read_notes", lambda run: read.append(len(run.notes)) or read_notes(run))
     monkeypatch.setattr(Watcher, "look", lambda self, at, *note: looked.append(at) or look(self, at, *note))
-    pixels = np.random.default_rng(0).integers(0, 256, (20, 3, 32, 32), dtype=np.uint8)
     tiny = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=2"]
     tiny += ["split=[0.8,0.2,0]", "images=80", "whitening.pictures=0", "fitting.examples=0"]
-    pictures = ImageSet(images=pixels, files=tuple(f"{number:02d}.png" for number in range(20)))
-    train(resolve("small", tiny), pictures, tmp_path / "run")
+    train(resolve("small", tiny), noise_set(20), tmp_path / "run")
     assert not any(asked[1:])  # in the first step tables are made
     assert read == [16, 16, 8] and looked == list(range(2, 82, 2))

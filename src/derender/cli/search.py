@@ -30,7 +30,6 @@ def search(
             raise ValueError(f"{out} is no PNG: give --out a name that ends in .png")
     import derender
     from derender.evaluation.score_table import Column, Row, ScoreTable
-    from derender.report.search_sheet import search_sheet
 
     how = {"metric": metric, "model": model, "copies": copies, "device": device}
     match = derender.search(features, like, factor, k, **how)
@@ -55,6 +54,8 @@ def search(
         more = f" and {len(others) - 1:,} more" if len(others) > 1 else ""
         notice(f"left out as the very same image: {others[0]}{more} (--copies finds it)")
     if out is not None:
+        from derender.report.protocols import search_sheet
+
         with progress_bar("finding images") as report:
             for name in search_sheet(match, out, data, dataset=dataset, progress=report):
                 notice(f"left out of the sheet: {name} cannot be read")

@@ -1,4 +1,4 @@
-"""Curves of accuracy over angle as a chart; masks in colours over their images.
+"""Curves of accuracy over angle as a chart; masks in colours over their images; what a search found.
 
 The chart has a panel for each axis. Controls are grey and dashed; the 95 % interval of the first features is
 shaded. Masks stand beside the answers of several networks, with a legend; left and right of a pair share a
@@ -6,6 +6,7 @@ hue. Leaves out computing anything (``derender.evaluation``).
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import cycle
 from math import ceil
 from pathlib import Path
@@ -15,9 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from PIL import Image
 
+from derender.data import Progress, Unreadable, decode, open_images, quiet_pillow, read_image
 from derender.evaluation.memory import content_hash
 from derender.evaluation.robust import SCORES, CurveResult, RobustnessComparison, level_name
 from derender.evaluation.segmentation import SegmentationComparison
+from derender.features.neighbours import Found
 from derender.report import colours
 from derender.report.charts import SERIES, side_by_side
 from derender.report.colours import Images
@@ -122,3 +125,51 @@ def write_overlays(result: SegmentationComparison, out: Path) -> Path:
 def _larger(images: np.ndarray, scale: int) -> Images:
     """Every pixel of (N, 3, S, S) repeated ``scale`` times each way."""
     return colours.pictures(images.repeat(scale, axis=2).repeat(scale, axis=3))
+
+
+CELL = 192
+
+
+def search_sheet(
+    result: Found,
+    out: Path,
+    images: str | None = None,
+    *,
+    dataset: str = "auto",
+    progress: Progress | None = None,
+) -> list[str]:
+    """Write the query and the nearest images as a contact sheet; gives the names of those it cannot read.
+
+    ``images`` is the address of the table's images, by default the one that the table records. ``dataset`` is
+    their layout, or "auto". ``progress`` is called with (images read, all).
+
+    Raises:
+        ValueError: the address is not known, or holds none of the images.
+    """
+    address = images if images is not None else str(result.table.origin.get("data", ""))
+    if not address:
+        raise ValueError("the table does not record where its images are: give their address")
+    captions = {result.table.files[row]: "query" for row in [result.own_row] if row is not None}
+    for row, distance in zip(result.rows, result.distances, strict=True):
+        captions.setdefault(result.table.files[row], f"{distance:.3f}")
+    missing, read = set(captions), {}
+    with open_images(address, dataset=dataset) as stream, quiet_pillow():
+        for sample in stream.samples():
+            if sample.file in missing:
+                missing.remove(sample.file)
+                with suppress(Unreadable, ValueError, OSError):
+                    read[sample.file] = decode(sample.read(), CELL, box=sample.box)
+                if progress is not None:
+                    progress(len(read), len(captions))
+            if not missing:
+                break
+    if not read:
+        some = list(captions)[-1]
+        raise ValueError(f"{address} holds none of the images found, such as {some!r}: give another address")
+    shown = [] if result.own_row is not None else [("query", read_image(Path(result.like), CELL))]
+    shown += [(caption, read[file]) for file, caption in captions.items() if file in read]
+    names, drawn = zip(*shown, strict=True)
+    title, layout = f"nearest by {result.factor}", GridLayout(cell=CELL)
+    sheet = contact_sheet(colours.pictures(np.stack(drawn)), names, across=7, title=title, layout=layout)
+    write_whole(out, png_bytes(sheet))
+    return [file for file in captions if file not in read]

@@ -25,9 +25,8 @@ from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.storage.folder import SplitRecord, write_split
 from derender.training import checkpoint, process, run_folder
 from derender.training.batches import Reader, batches_of, random_stream
-from derender.training.compiled import compile_networks
-from derender.training.cuda_graph import Replayed
 from derender.training.distributed import open_fabric, ranks_of
+from derender.training.faster import Replayed, compile_networks
 from derender.training.task import (
     Progress,
     Step,

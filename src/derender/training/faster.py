@@ -1,18 +1,83 @@
-"""A training step recorded once as a CUDA graph and replayed: the host launches it whole, not by kernels.
+"""Two ways to make training steps faster, each timed on the steps of the run and left where it is slower.
 
-The kernels of a step take microseconds each, so that it waits for the host most of the time. Both ways run
-the same kernels and give the same bits: a run may change between them, and resumes exactly.
+Networks are compiled by torch.compile (inductor): decided before the first step, for compiled kernels round
+at other places. So the choice belongs to the state of a run, which resumes as it began. On a GPU a step is
+recorded once as a CUDA graph and replayed: the host launches it whole, not by kernels. These take
+microseconds each, so that a step waits for the host most of the time. Replayed or not it runs the same
+kernels and gives the same bits: a run may change between them, and resumes exactly.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 
-WARMING = 16  # ordinary steps before the clock runs; kernels are compiled in them
-TIMED = 16  # steps of either way that are timed
+TRIED = 4  # steps with networks compiled or not that are timed, after a first one that may compile
+SAME_LOSS = 0.02  # largest relative difference of the loss, as bfloat16 rounds
+WARMING = 16  # ordinary steps before the clock of replaying runs; kernels are compiled in them
+TIMED = 16  # steps, replayed or not, that are timed
+
+
+def compile_networks(
+    model: nn.Module, step: Callable[[], float], report: Callable[[str], None], wanted: bool | None = None
+) -> bool:
+    """Compile a model's networks in place if steps are faster with it, or as ``wanted``; whether they are.
+
+    Args:
+        step: losses and gradients of one batch, to the loss; it changes no weights.
+        report: is given a sentence once both ways were timed.
+        wanted: what a resumed run began with; None decides.
+
+    Raises:
+        ValueError: compiled networks are wanted, and this machine cannot compile.
+    """
+    if wanted is False:
+        return False
+    eager, expected = (0.0, None) if wanted else _timed(step)
+    with torch._dynamo.config.patch(recompile_limit=64):  # networks of one class share its code
+        for network in networks_of(model):
+            network.compile(dynamic=False)
+        try:
+            seconds, loss = _timed(step)
+        except RuntimeError as error:  # no C++ compiler, or a kernel that cannot be built
+            why = f"cannot be compiled ({str(error).strip().splitlines()[0]})"
+        else:
+            if expected is None:
+                return True
+            faster = eager / seconds
+            why = f"are slower compiled ({faster:.2f} times the speed)"
+            if not abs(loss - expected) <= SAME_LOSS * abs(expected):
+                why = f"give another loss compiled ({loss:.6g} for {expected:.6g})"
+            elif faster > 1:
+                report(f"networks are compiled: steps are {faster:.2f} times as fast")
+                return True
+    if wanted:
+        raise ValueError(f"this run began with compiled networks, which {why}: resume it with compile=off")
+    for network in networks_of(model):
+        network._compiled_call_impl = None
+    report(f"networks are not compiled: they {why}")
+    return False
+
+
+def networks_of(module: nn.Module) -> Iterator[nn.Module]:
+    """The outermost modules within one that have a forward of their own."""
+    for child in module.children():
+        if type(child).forward is nn.Module.forward:
+            yield from networks_of(child)
+        else:
+            yield child
+
+
+def _timed(step: Callable[[], float]) -> tuple[float, float]:
+    """Seconds of the fastest step after the first, and its loss."""
+    loss, seconds = step(), []
+    for _ in range(TRIED):
+        began = time.perf_counter()
+        loss = step()
+        seconds.append(time.perf_counter() - began)
+    return min(seconds), loss
 
 
 class Replayed:
