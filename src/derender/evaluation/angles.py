@@ -20,7 +20,7 @@ from torch import Tensor
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet
 from derender.data.layouts import rendered
-from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of
 from derender.evaluation.image_scores import binned_rows
 from derender.evaluation.options import Options
 from derender.evaluation.scenes import optimised
@@ -129,7 +129,7 @@ def _angles(
         parts = map_batches(partial(see, net), net, read.images, batch_size=64, progress=how.stage(name))
         results[name] = np.concatenate(parts)
     people = read.labels.get("identity", np.array(read.files)).astype(str)
-    weights = once_and_resampled(people, how.resamples, how.seed)
+    weights = how.drawn(people)
     tables: list[ScoreTable] = []
     values: dict[str, Any] = {"pictures": len(read)}
     for column, name in enumerate(labels):
@@ -143,9 +143,7 @@ def _angles(
         aimed["constant answer"] = np.broadcast_to(aim.mean(axis=0), aim.shape)
         apart = {name: angle_deg(torch.tensor(own), torch.tensor(aim)).numpy() for name, own in aimed.items()}
         off = np.degrees(np.arccos(np.clip(aim[:, 2], -1, 1))).round(3)
-        rows, columns, _ = binned_rows(
-            apart, off, best="low", digits=1, groups=people, resample_count=how.resamples, seed=how.seed
-        )
+        rows, columns, _ = binned_rows(apart, off, weights, best="low", digits=1)
         caption = "Light: degrees between true and predicted direction, by the angle between light and view"
         tables.append(scored_table(caption, "prediction", rows, columns, deviations=()))
         values["direction"] = numbers_of(rows)

@@ -74,10 +74,8 @@ def identify(
 
     right = {name: np.mean(list(map(recognised, runs)), axis=0) for name, runs in ready.features.items()}
     right["chance"] = (who[shown] == who[probe, None]).mean(axis=1)
-    scored, columns, probes = binned_rows(
-        right, None if angle is None else angle[probe], bins=bins, controls=(*ready.controls, "chance"),
-        groups=who[probe], resample_count=how.resamples, seed=how.seed,
-    )  # fmt: skip
+    angles, quiet = None if angle is None else angle[probe], (*ready.controls, "chance")
+    scored, columns, probes = binned_rows(right, angles, how.drawn(who[probe]), quiet, bins=bins)
     near = known & (angle <= cluster_within) if angle is not None else np.zeros(len(who), bool)
     if len(set(who[near])) > 1 and len(set(who[near])) < near.sum():
         codes = {name: [run[near] for run in runs] for name, runs in ready.features.items()}
@@ -226,8 +224,7 @@ def verify(
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
-    weights = bootstrap.once_and_resampled(len(pairs), how.resamples, how.seed)
-    scored, errors = [], {}
+    weights, scored, errors = how.drawn(len(pairs)), [], {}
     for row in rows:
         runs = [_judged(run, sides, pairs) for run in row.arrays()]
         right = np.mean([own for own, _ in runs], axis=0)

@@ -49,7 +49,8 @@ class ImageResult:
 
     def rows(self, resample_count: int = bootstrap.RESAMPLES) -> tuple[bootstrap.ScoredRow, ...]:
         """The model, then its controls, with intervals."""
-        return image_rows(self.each(), self.columns, resample_count=resample_count)
+        count = len(next(iter(self.each()["model"].values())))
+        return image_rows(self.each(), self.columns, bootstrap.once_and_resampled(count, resample_count))
 
     def table(self, rows: Sequence[bootstrap.ScoredRow] | None = None) -> ScoreTable:
         """The scores in the units of the columns; with ``rows``, their intervals too."""
@@ -71,18 +72,12 @@ def means_and_each(**scores: Tensor) -> dict[str, Any]:
 def image_rows(
     scores: Mapping[str, Mapping[str, np.ndarray]],
     columns: Mapping[str, Column],
-    *,
+    weights: np.ndarray,
     controls: Collection[str] | None = None,
-    groups: np.ndarray | None = None,
-    resample_count: int = bootstrap.RESAMPLES,
-    seed: int = 0,
 ) -> tuple[bootstrap.ScoredRow, ...]:
     """A row for each name in ``scores``, which holds every score's (N,) values of the same images, NaN where
-    there is none. ``controls`` are by default all rows but the first; images of one of the (N,) ``groups``,
-    such as people, are resampled together.
+    there is none. ``weights`` are by ``once_and_resampled``, ``controls`` by default all rows but the first.
     """
-    count = max(len(values) for each in scores.values() for values in each.values())
-    weights = bootstrap.once_and_resampled(count if groups is None else groups, resample_count, seed)
     quiet = list(scores)[1:] if controls is None else controls
     rows = []
     for name, each in scores.items():
@@ -95,16 +90,17 @@ def image_rows(
 def binned_rows(
     scores: Mapping[str, np.ndarray],
     angle: np.ndarray | None,
+    weights: np.ndarray,
+    controls: Collection[str] | None = None,
     *,
     best: Literal["high", "low"] = "high",
     digits: int = 3,
     bins: Sequence[float] = LIGHT_BINS_DEG,
-    **how: Any,
 ) -> tuple[tuple[bootstrap.ScoredRow, ...], dict[str, Column], dict[str, int]]:
     """Rows of (N,) scores; columns for all and for groups by (N,) angles in degrees; number of images in
     each.
 
-    ``bins`` are upper edges; larger angles are "beyond". ``how`` is that of ``image_rows``.
+    ``bins`` are upper edges; larger angles are "beyond". The rest is as of ``image_rows``.
     """
     count = len(next(iter(scores.values())))
     inside = {"all": np.ones(count, bool)}
@@ -119,7 +115,7 @@ def binned_rows(
         row: {name: np.where(rows, own, np.nan) for name, rows in inside.items()}
         for row, own in scores.items()
     }
-    return image_rows(each, columns, **how), columns, counts
+    return image_rows(each, columns, weights, controls), columns, counts
 
 
 def _estimate(values: np.ndarray, weights: np.ndarray) -> bootstrap.Estimate:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from derender.data import ImageSet
-from derender.evaluation.bootstrap import RESAMPLES
+from derender.evaluation.bootstrap import RESAMPLES, once_and_resampled
 from derender.evaluation.memory import Memory, memory_in
 from derender.inputs import Progress, as_images
 
@@ -76,6 +76,10 @@ class Options:
     def scoring(self) -> dict[str, Any]:
         """Keywords of comparisons on arrays: resamples, their seed and the cache."""
         return {"resample_count": self.resamples, "seed": self.seed, "memory": self.memory}
+
+    def drawn(self, groups: np.ndarray | int) -> np.ndarray:
+        """``once_and_resampled`` with these resamples and this seed."""
+        return once_and_resampled(groups, self.resamples, self.seed)
 
     def seeds(self, count: int) -> tuple[int, ...]:
         """So many seeds, from ``seed`` on."""

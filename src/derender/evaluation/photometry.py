@@ -25,7 +25,7 @@ from derender.baselines.controls import LUMINANCE, untrained_twin
 from derender.data import ImageSet, read_ground_truth
 from derender.data.image_set import as_float
 from derender.evaluation.angles import agreement, agreement_table
-from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of, once_and_resampled
+from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of
 from derender.evaluation.image_scores import binned_rows, image_rows
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import reconstruction_scores
@@ -85,13 +85,13 @@ def brightness(
     nothing = np.ones(len(mean))
     seen["image as albedo"] = {"albedo": seen["model"]["image"], "light": nothing}
     people = truth.labels.get("identity", np.arange(len(mean))).astype(str)
-    weights = once_and_resampled(people, how.resamples, how.seed)
+    weights = how.drawn(people)
     caption = f"Brightness of albedo, 0 to 1: {len(mean):,} images of {len(set(people))} surfaces"
     bright = {name: one["albedo"] @ LUMA for name, one in seen.items()}
     table, numbers = agreement_table(caption, bright, mean @ LUMA, weights, digits=3)
     seen["constant answer"] = {"albedo": np.tile(mean.mean(axis=0), (len(mean), 1)), "light": nothing}
     apart = {name: {"chroma": _apart(one["albedo"], mean)} for name, one in seen.items()}
-    rows = image_rows(apart, {"chroma": _CHROMA}, groups=people, resample_count=how.resamples, seed=how.seed)
+    rows = image_rows(apart, {"chroma": _CHROMA}, weights)
     light = {name: agreement(one["light"], mean @ LUMA, weights)["r"] for name, one in seen.items()}
     rows = [replace(row, scores={**row.scores, "light": light[row.name]}) for row in rows]
     columns = {"chroma": _CHROMA, "light": _LIGHT}
@@ -133,7 +133,7 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     if len(names) < 2:
         raise ValueError(f"{by!r} has {len(names)} groups: two or more are needed")
     seen = {name: surfaces(net, images.images, None, how.stage(name)) for name, net in nets.items()}
-    weights = once_and_resampled(len(group), how.resamples, how.seed).astype(np.float64)
+    weights = how.drawn(len(group)).astype(np.float64)
     member = (group[:, None] == names).astype(np.float64)
 
     def means(values: np.ndarray) -> np.ndarray:
@@ -252,11 +252,10 @@ def relight(
         raise ValueError("no two people have images in the same two lights: nothing to compare")
     tables, notes = [], list(how.notes)
     values: dict[str, Any] = {"pictures": len(rows), "people": len(people)}
+    weights = how.drawn(who[rows])
     for title, unit, digits in (("PSNR", "dB", 1), ("SSIM", "at most 1", 3)):
-        scored, columns, _ = binned_rows(
-            {name: np.concatenate(parts) for name, parts in apart[title].items()}, off[rows],
-            controls=CONTROLS, groups=who[rows], digits=digits, resample_count=how.resamples, seed=how.seed,
-        )  # fmt: skip
+        each = {name: np.concatenate(parts) for name, parts in apart[title].items()}
+        scored, columns, _ = binned_rows(each, off[rows], weights, CONTROLS, digits=digits)
         caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {len(people)} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
         values[title.lower()] = numbers_of(scored)

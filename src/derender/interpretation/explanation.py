@@ -15,6 +15,7 @@ from sklearn.metrics import roc_auc_score
 
 from derender.baselines.controls import untrained_twin
 from derender.data import ImageSet, suggestion
+from derender.evaluation.bootstrap import once_and_resampled
 from derender.evaluation.clustering_methods import clusterings
 from derender.evaluation.feature_rows import chosen_labels
 from derender.evaluation.image_scores import image_rows
@@ -250,7 +251,7 @@ def _row(name: str, runs: Sequence[Sequence[np.ndarray]]) -> tables.ShareRow:
     known = np.ma.masked_invalid(shares)
     each = known.mean(axis=0).filled(np.nan)  # of images
     cells = {str(at): values for at, values in enumerate(each.reshape(len(each), -1).T)}
-    (scored,) = image_rows({name: cells}, {}, controls=[name], resample_count=BOOTSTRAP)
+    (scored,) = image_rows({name: cells}, {}, once_and_resampled(len(each), BOOTSTRAP))
     ends = np.array([(one.low, one.high) for one in scored.scores.values()])
     low, high = ends.T.reshape(2, *each.shape[1:])
     error, scale = largest.max(axis=0)
