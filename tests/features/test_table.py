@@ -1,4 +1,4 @@
-"""FeatureTable: what goes in comes out, from memory and from the file; wrong tables cannot exist."""
+"""FeatureTable: what goes in comes out, from a model, memory and the file; wrong tables cannot exist."""
 
 import json
 
@@ -6,9 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 from tests.features.conftest import assert_same
 
-from derender.features import FeatureTable, missing
+from derender.features import FeatureTable, embed_image_set, missing, model_fingerprint
 
 
 def make(rows: int = 5, **labels) -> FeatureTable:
@@ -200,3 +201,23 @@ def test_mean_by_averages_groups_and_keeps_what_is_constant():
 )
 def test_missing_knows_every_way_to_be_missing(labels, expected):
     assert missing(labels).tolist() == expected
+
+
+def test_features_are_those_of_the_model_whatever_the_batch(model, pictures):
+    expected = model.eval().embed(torch.from_numpy(pictures.images).float() / 255)
+    for size in (1, 4, 11, 100):
+        seen: list[tuple[int, int]] = []
+        table = embed_image_set(model, pictures, batch_size=size, progress=lambda *at, to=seen: to.append(at))
+        assert seen == [(min(end, 11), 11) for end in range(size, 11 + size, size)]
+        for name in expected:
+            np.testing.assert_allclose(table.factors[name], expected[name].detach(), rtol=1e-5, atol=1e-5)
+
+
+def test_labels_partition_and_origin_go_with_the_features(model, pictures, tmp_path):
+    table = embed_image_set(model, pictures, origin={"model": "runs/x"})
+    assert table.files == pictures.files
+    assert table.label("identity").tolist() == pictures.labels["identity"].tolist()
+    assert table.label("partition").tolist() == ["train"] * 6 + ["test"] * 5
+    assert table.origin["model"] == "runs/x" and table.origin["data"] == "made"
+    assert table.origin["weights"] == model_fingerprint(model)
+    assert FeatureTable.read(table.write(tmp_path / "t.parquet")).origin == table.origin
