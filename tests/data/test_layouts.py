@@ -37,6 +37,8 @@ LANDMARKS = (
     "000001.jpg  20 30 30 30 25 35 21 40 29 40\n000002.jpg  20 30 24 30 22 35 20 40 24 40\n"
 )
 MARKED = {"list_landmarks_celeba.txt": LANDMARKS}
+SIDES = "file,left,top,right,bottom\n000001.jpg,2,3,22,33\n000002.jpg,5,1,25,21\n000003.jpg,0,0,40,30\n"
+SIZED = "file,left,top,width,height\n000001.jpg,2,3,20,30\n000002.jpg,5,1,20,20\n"
 PARAMS = "file,identity,expression,strength,ambient,diffuse,light_pitch,light_yaw,pitch,yaw,roll,tx,ty\n"
 FIRST = "images/000000.jpg,7,happy,0.5,0.3,0.6,30,-45,10,20,5,0.001,-0.002\n"
 SYNFACE = {
@@ -263,6 +265,11 @@ FAULTS = [
     ({**ATTRIBUTES, "img_align_celeba.zip": "x"}, {}, r"list_attr_celeba\.txt and img_align_celeba"),
     ({**WILD, **MARKED, "list_eval_partition.txt": "000001.jpg 3\n"}, {}, r"line 1: .* of 0 \(train\), .*"),
     ({**WILD, "list_landmarks_celeba.txt": LANDMARKS.replace("lefteye_x", "x")}, {}, "no column 'lefteye"),
+    ({**WILD, "boxes.csv": SIZED}, {}, r"boxes\.csv .* no row for 000003\.jpg \(1 of 3 images have none"),
+    ({**WILD, "boxes.csv": SIZED + "000003.jpg,1,2,3\n"}, {}, "line 4: expected 5 values as in the header"),
+    ({**WILD, "boxes.csv": SIZED + "000003.jpg,1,2,3,x\n"}, {}, "something that is no number .*'x'"),
+    ({**WILD, "boxes.csv": SIZED + "000003.jpg,1,2,nan,4\n"}, {}, r"the box of 000003\.jpg has no area"),
+    ({**WILD, "boxes.csv": SIZED.replace("width", "w")}, {}, "no column 'right'; its columns are file,"),
     ({**SYNFACE, TRAIN: PARAMS.replace("file", "name")}, {"dataset": "synface"}, "no column 'file'; its"),
     ({**SYNFACE, TRAIN: f"{PARAMS}{ROW}{',x' * 12}\n"}, {}, "column 'strength' holds something that is no"),
     ({**SYNFACE, TRAIN: PARAMS + "x" * 200_000}, {}, "is no CSV table"),
@@ -382,6 +389,12 @@ def test_celeba_in_the_wild_is_cropped_by_landmarks(tree, encoded, tmp_path):
     tree({"list_landmarks_celeba.txt": LANDMARKS.replace("20 30 30 30", "22 30 32 30")})
     second = read_images(source, 10, cache=tmp_path / "cache").images
     assert (second[0] != expected[0]).any() and (second[1] == expected[1]).all()
+    for own, last in ((SIZED + "000003.jpg,-5,-4,30,30\n", [-5, -4, 25, 26]), (SIDES, [0, 0, 40, 30])):
+        boxes = [[2, 3, 22, 33], [5, 1, 25, 21], last]  # of a list of one's own, which may stick out a little
+        assert found_in(tree({"boxes.csv": own})).table.boxes.tolist() == boxes
+        pairs = zip(contents.values(), boxes, strict=True)
+        cut = [decode(content, 10, "crop", np.array(box, np.float32)) for content, box in pairs]
+        assert (read_images(source, 10).images == np.stack(cut)).all()
 
 
 def test_a_half_is_by_person_and_the_same_in_every_set(tree):
