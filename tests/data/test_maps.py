@@ -89,21 +89,6 @@ def test_depth_code_limits_and_optional_maps(rendered, encoded):
     assert truth.normal is None and truth.albedo is None
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("mask/000001.png", None, r"has no test_gt/mask/000001\.png, which other images have"),
-        ("depth/000000.png", png(np.zeros((4, 6), np.uint8)), r"000000\.png .* is L \(4, 6\); expected I;16"),
-        ("normal/000001.png", png(np.zeros((5, 6, 3), np.uint8)), r"000001\.png .* all of one size"),
-        ("albedo/000000.png", b"text", r"albedo/000000\.png in .* cannot be read"),
-        ("params.csv", (HEADER + ROWS).replace("_yaw", "").encode(), "lacks the column for 'light_yaw_rad'"),
-    ],
-)
-def test_misfits_are_named(rendered, name, content, message):
-    with pytest.raises(ValueError, match=message):
-        read_ground_truth(rendered({name: content}))
-
-
 @pytest.fixture
 def pairs(tree, encoded):
     """``pairs(bits, names)`` writes three test images and two training images with their depth maps."""
@@ -166,19 +151,6 @@ def test_maps_shrink_with_their_images_over_the_object_alone(tree, encoded):
     assert truth.mask[0, :, :3].tolist() == [[1, 0, 0], [1, 0, 0], [1, 1, 1], [0, 0, 0]]
     np.testing.assert_allclose(truth.depth[0, :2, 0], 0.9, rtol=1e-6)
     np.testing.assert_allclose(truth.depth[0, 2], 1.1 - 0.2 * 0.3, rtol=1e-6)
-
-
-def test_depth_maps_that_do_not_fit_are_named(pairs):
-    name = "synface/test/depth/000_depth.png"
-    for content, message in (
-        (b"nothing", r"depth/000_depth\.png in .* cannot be read"),
-        (picture(0, SIZE), r"000_depth\.png .* is RGB \(12, 12, 3\); a depth map is a grey PNG"),
-        (png(np.full((6, 6), 9, np.uint8)), r"is \(12, 12\), its map .*000_depth\.png \(6, 6\): both must"),
-    ):
-        path = pairs(extra={name: content})
-        with pytest.raises(ValueError, match=message):
-            read_ground_truth(path)
-    assert read_ground_truth(path, image_size=6).depth.shape == (3, 6, 6)
 
 
 @pytest.fixture
@@ -272,21 +244,44 @@ def test_official_parts_and_attributes(tree, published):
         read_masks(source, 8, subset="validation")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (png(ZERO + 19), r"masks/1\.png .* the number 19; classes are 0 \(background\) to 18 \(cloth\)"),
-        (png(ZERO.astype(np.uint16) + 300), "holds the number 300; classes are 0"),
-        (png(np.tile(ZERO, (1, 2))), r"is 64 x 32 and its image images/1\.jpg 32 x 32: .* the aspect ratio"),
-        (png(Image.fromarray(ZERO).convert("RGB")), "has 3 channels; a mask has one, of class numbers"),
-        (b"no image", r"masks/1\.png in .* cannot be read"),
-        (png(noise(1, channels=1))[:90], r"masks/1\.png in .* cannot be read"),
-    ],
-    ids=["class 19", "class 300", "wide", "colours", "text", "cut"],
-)
-def test_a_mask_that_does_not_fit_is_named(tree, merged, content, message):
+DEPTH = "synface/test/depth/000_depth.png"
+MISFITS = [
+    ("rendered", "mask/000001.png", None, r"has no test_gt/mask/000001\.png, which other images have"),
+    ("rendered", "depth/000000.png", png(ZERO[:4, :6]), r"000000\.png .* is L \(4, 6\); expected I;16"),
+    ("rendered", "normal/000001.png", picture(0, 5), r"000001\.png .* all of one size"),
+    ("rendered", "albedo/000000.png", b"text", r"albedo/000000\.png in .* cannot be read"),
+    ("rendered", "params.csv", (HEADER + ROWS).replace("_yaw", "").encode(), "lacks .* 'light_yaw_rad'"),
+    ("pairs", DEPTH, b"nothing", r"depth/000_depth\.png in .* cannot be read"),
+    ("pairs", DEPTH, picture(0, SIZE), r"000_depth\.png .* is RGB \(12, 12, 3\); a depth map is a grey PNG"),
+    ("pairs", DEPTH, png(ZERO[:6, :6] + 9), r"is \(12, 12\), its map .*000_depth\.png \(6, 6\): both must"),
+    (
+        "masked",
+        "",
+        png(ZERO + 19),
+        r"masks/1\.png .* the number 19; classes are 0 \(background\) to 18 \(clot",
+    ),
+    ("masked", "", png(ZERO.astype(np.uint16) + 300), "holds the number 300; classes are 0"),
+    ("masked", "", png(np.tile(ZERO, (1, 2))), r"is 64 x 32 and its image images/1\.jpg 32 x 32: .* aspect"),
+    ("masked", "", picture(0), "has 3 channels; a mask has one, of class numbers"),
+    ("masked", "", b"no image", r"masks/1\.png in .* cannot be read"),
+    ("masked", "", png(noise(1, channels=1))[:90], r"masks/1\.png in .* cannot be read"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "content", "message"), MISFITS)
+def test_misfits_are_named(rendered, pairs, merged, tree, kind, name, content, message):
+    read = {
+        "rendered": lambda: read_ground_truth(rendered({name: content})),
+        "pairs": lambda: read_ground_truth(pairs(extra={name: content})),
+        "masked": lambda: read_masks(tree({**merged, "masks/1.png": content}), 8),
+    }
     with pytest.raises(ValueError, match=message):
-        read_masks(tree({**merged, "masks/1.png": content}), 8)
+        read[kind]()
+
+
+def test_depth_maps_of_another_size_fit_at_one_that_is_given(pairs):
+    path = pairs(extra={DEPTH: png(ZERO[:6, :6] + 9)})
+    assert read_ground_truth(path, image_size=6).depth.shape == (3, 6, 6)
 
 
 def test_missing_masks_images_and_lines_are_named(tree, published, merged):

@@ -7,8 +7,8 @@ stopped run continues after the last photograph that it finished. Leaves out fin
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from io import StringIO
 from math import cos, radians, sin
 from pathlib import Path, PurePosixPath
@@ -136,7 +136,7 @@ def align(
                     results = list(cutter.rows(sample.file, sample.read))
                     with partial.open("a", newline="", encoding="utf-8") as file:
                         csv.DictWriter(file, COLUMNS).writerows(results)
-                    rows += [{name: str(row.get(name, "")) for name in COLUMNS} for row in results]
+                    rows += results
                 if progress is not None:
                     progress(number, estimated_total(number, sample.share, stream.limit))
                 if number == stream.limit:
@@ -156,7 +156,7 @@ def align(
 
 @dataclass(frozen=True)
 class _Cutter:
-    """Cuts the faces of one photograph out, and writes them."""
+    """Cuts the faces of photographs out, and writes them."""
 
     out: Path
     size: int
@@ -168,34 +168,35 @@ class _Cutter:
     held_out: HeldOutErrors | None
     taken: set[str] = field(default_factory=set)  # names of crops, in lower case
 
-    def rows(self, name: str, read: Any) -> Iterator[dict[str, Any]]:
+    def rows(self, photo: str, read: Callable[[], bytes]) -> Iterator[dict[str, str]]:
         """Write the crops of one photograph; rows for its boxes."""
         try:
             with quiet_pillow():
                 pixels = decode_whole(read())
         except (ValueError, OSError) as problem:
-            yield {"photo": name, "rejected": UNREADABLE + " ".join(str(problem).split())}
+            yield _row(photo, UNREADABLE + " ".join(str(problem).split()))
             return
-        accepted, faces = 0, face_candidates(pixels)
-        for face in faces:
+        accepted = 0
+        for face in face_candidates(pixels):
             frame = frame_of(face, self.template)
-            row: dict[str, Any] = {
-                "photo": name,
-                "rejected": face.rejected or self._doubt(pixels, face, frame),
-            }
-            if not row["rejected"] and self.largest and accepted:
-                row["rejected"] = "not the largest face"
-            frame = Frame(frame.x, frame.y, frame.side * (1 + 2 * self.margin), frame.roll_deg)
-            if not row["rejected"]:
-                accepted += 1
-                row["file"] = self._write(pixels, frame, name, accepted)
-            yield row | _box(face) | _place(frame, self.size)
+            rejected = face.rejected or self._doubt(pixels, face, frame)
+            if not rejected and self.largest and accepted:
+                rejected = "not the largest face"
+            accepted += not rejected
+            frame = replace(frame, side=frame.side * (1 + 2 * self.margin))
+            file = "" if rejected else self._write(pixels, frame, photo, accepted)
+            yield _row(photo, rejected, file, (face.confidence, *face.box), self._place(frame))
         if not accepted:
             middle = Frame.centred(pixels.shape[1], pixels.shape[0])
-            row = {"photo": name, "rejected": NO_FACE}
-            if self.keep:
-                row |= {"file": self._write(pixels, middle, name, 1), **_place(middle, self.size)}
-            yield row
+            file = self._write(pixels, middle, photo, 1) if self.keep else ""
+            yield _row(photo, NO_FACE, file, place=self._place(middle) if self.keep else ())
+
+    def _place(self, frame: Frame) -> tuple[float, ...]:
+        """Frame and transform: photograph = (xx u + xy v + x0, yx u + yy v + y0) for crop pixels (u, v)."""
+        scale, angle = frame.side / self.size, radians(frame.roll_deg)
+        c, s = scale * cos(angle), scale * sin(angle)
+        x0, y0 = frame.corners()[0]
+        return frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0
 
     def _write(self, pixels: np.ndarray, frame: Frame, photo: str, number: int) -> str:
         """Write a part of a photograph as the face of that number; the name of its file."""
@@ -226,20 +227,15 @@ class _Cutter:
         return f"the model reconstructs it worse than {percentile:.0f} % of the images it was validated on"
 
 
-def _box(face: Face) -> dict[str, Any]:
-    return _rounded(COLUMNS[3:8], (face.confidence, *face.box))
-
-
-def _place(frame: Frame, size: int) -> dict[str, Any]:
-    """Frame and transform: photograph = (xx u + xy v + x0, yx u + yy v + y0) for crop pixels (u, v)."""
-    scale, angle = frame.side / size, radians(frame.roll_deg)
-    c, s = scale * cos(angle), scale * sin(angle)
-    x0, y0 = frame.corners()[0]
-    return _rounded(COLUMNS[8:], (frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0))
-
-
-def _rounded(names: Sequence[str], values: Sequence[float]) -> dict[str, Any]:
-    return {name: round(float(value), 4) for name, value in zip(names, values, strict=True)}
+def _row(
+    photo: str, rejected: str, file: str = "", box: Sequence[float] = (), place: Sequence[float] = ()
+) -> dict[str, str]:
+    """A row of the table; ``box`` is confidence and sides, ``place`` everything after."""
+    numbers = dict(zip(COLUMNS[3:8], box, strict=False)) | dict(zip(COLUMNS[8:], place, strict=False))
+    row = {"file": file, "photo": photo, "rejected": rejected}
+    return (
+        dict.fromkeys(COLUMNS, "") | row | {name: str(round(float(one), 4)) for name, one in numbers.items()}
+    )
 
 
 def _known(model: Derenderer | str | Path | None) -> tuple[Template, Derenderer | None, HeldOutErrors | None]:

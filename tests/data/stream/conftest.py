@@ -8,6 +8,13 @@ from pathlib import Path
 import pytest
 
 
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch) -> Path:
+    """A cache of our own."""
+    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
 @pytest.fixture
 def shard(tmp_path: Path, encoded) -> Callable[..., Path]:
     def write(name: str, members: dict[str, bytes | str | None], mode: str = "w", first: int = 0) -> Path:

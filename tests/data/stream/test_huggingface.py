@@ -17,8 +17,7 @@ datasets = pytest.importorskip("datasets", reason="needs the extra: pip install 
 
 @pytest.fixture(autouse=True)
 def places(tmp_path, monkeypatch) -> Path:
-    """A cache of our own and of the library's, and no network."""
-    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
+    """A cache of the library's own, and no network."""
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "hf")
     monkeypatch.chdir(tmp_path)
     datasets.disable_progress_bars()

@@ -3,19 +3,12 @@
 import io
 import json
 import tarfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from derender.data import read_image, read_images
 from derender.data.streamed import expand_braces, find_shards
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch) -> Path:
-    monkeypatch.setenv("DERENDER_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def members(count: int, first: int = 0) -> dict[str, bytes | str | None]:
