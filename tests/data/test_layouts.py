@@ -124,13 +124,25 @@ def found_in(source, **options):
         return result
 
 
+PLAIN = [  # nothing more particular
+    ("classes", images("cats/siamese/1.jpg", "dogs/pug/2.jpg")),
+    ("classes", images("train/0/1.png", "train/1/2.png", "test/0/3.png")),
+    ("folder", images("train/1.png", "test/2.png")),
+    ("folder", images("cat/1.png", "dog/2.png", "3.png")),
+    ("folder", images("only/1.png", "only/2.png")),
+    ("classes", images("one/0/1.png", "one/1/2.png")),
+    ("folder", images(*(f"{name}.png" for name in IDS))),  # scraped images are named by a checksum
+    ("folder", {"metadata.csv": "camera,lens\nx,y\n", "1.png": None}),
+]
+
+
 @pytest.mark.parametrize("zipped", [False, True])
 @pytest.mark.parametrize("wrapped", [False, True])
-@pytest.mark.parametrize("name", [layout.name for layout in LAYOUTS])
-def test_recognised_wherever_the_tree_lies(tree, name, zipped, wrapped):
+@pytest.mark.parametrize(("name", "files"), [*((one.name, TREES[one.name]) for one in LAYOUTS), *PLAIN])
+def test_recognised_wherever_the_tree_lies(tree, name, files, zipped, wrapped):
     """As published, and inside a folder that an archive program added."""
     around = "download/" if wrapped else ""
-    result = found_in(tree({around + file: content for file, content in TREES[name].items()}, zipped))
+    result = found_in(tree({around + file: content for file, content in files.items()}, zipped))
     assert result.layout == name
     for column in result.table.labels.values():
         assert len(column) == len(result.table.files) > 0
@@ -222,23 +234,6 @@ def test_labels_and_parts_are_those_published(tree, name):
             np.testing.assert_allclose(table.labels[column], values, rtol=1e-6, err_msg=column)
             assert table.labels[column].dtype in (np.float32, np.int8)
     assert (None if table.partition is None else table.partition.tolist()) == partition
-
-
-@pytest.mark.parametrize(
-    ("files", "layout"),
-    [
-        (images("cats/siamese/1.jpg", "dogs/pug/2.jpg"), "classes"),
-        (images("train/0/1.png", "train/1/2.png", "test/0/3.png"), "classes"),
-        (images("train/1.png", "test/2.png"), "folder"),
-        (images("cat/1.png", "dog/2.png", "3.png"), "folder"),
-        (images("only/1.png", "only/2.png"), "folder"),
-        (images("one/0/1.png", "one/1/2.png"), "classes"),
-        (images(*(f"{name}.png" for name in IDS)), "folder"),  # scraped images are named by a checksum
-        ({"metadata.csv": "camera,lens\nx,y\n", "1.png": None}, "folder"),
-    ],
-)
-def test_taken_for_nothing_more_particular(tree, files, layout):
-    assert found_in(tree(files)).layout == layout
 
 
 def test_sub_folders_separators_and_names_that_overrule(tree):

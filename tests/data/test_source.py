@@ -76,17 +76,15 @@ def bomb(path: Path, name: str, monkeypatch) -> Path:
     return path
 
 
-def test_a_mask_that_is_a_bomb_is_an_error(tree, monkeypatch):
-    masked = bomb(tree(["images/0.jpg"], zipped=True, name="masked"), "masks/0.png", monkeypatch)
-    with pytest.raises(ValueError, match=r"masks/0\.png in .* cannot be read: unpacks to 3 MiB"):
-        read_masks(masked, 8)
+BOMBS = ["list_attr_celeba.txt", "list_patition_label.txt", "x.ids", "data.csv", "masks/0.png"]
 
 
-@pytest.mark.parametrize("name", ["list_attr_celeba.txt", "list_patition_label.txt", "x.ids", "data.csv"])
-def test_a_list_that_is_a_bomb_is_an_error(tree, monkeypatch, name):
-    path = bomb(tree(["1/000001_aligned.jpg"], zipped=True), name, monkeypatch)
-    with pytest.raises(ValueError, match="unpacks to 3 MiB, more than 1 MiB"):
-        list_images(path)
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_list_or_mask_that_is_a_bomb_is_an_error(tree, monkeypatch, name):
+    path = bomb(tree(["1/000001_aligned.jpg", "images/0.jpg"], zipped=True), name, monkeypatch)
+    masks = name.startswith("masks")
+    with pytest.raises(ValueError, match=f"{name if masks else ''}.*unpacks to 3 MiB, more than 1 MiB"):
+        read_masks(path, 8, dataset="celebamask") if masks else list_images(path)
 
 
 def test_a_zip_that_is_none_or_cut_is_named(tree, tmp_path):

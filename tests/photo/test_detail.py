@@ -110,12 +110,16 @@ def test_strong_new_light_keeps_fine_detail():
     assert grain(seen).std() > 0.9 * grain(truth).std()
 
 
+def drawn_head(yaw_deg: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """A generated head's image (3, 128, 128) and mask (128, 128)."""
+    light = LIGHTS["frontal"].model_copy(update={"yaw_deg": (0, 0)})
+    view = VIEWS["frontal"].model_copy(update={"yaw_deg": (yaw_deg, yaw_deg)})
+    head = faces.generate(1, 128, 4, FaceSettings(light=light, view=view, backgrounds=("plain",)))
+    return torch.from_numpy(head.images[0]) / 255, torch.from_numpy(head.mask[0] > 0)
+
+
 def test_new_light_leaves_what_is_behind_the_object():
-    light, view = LIGHTS["frontal"].model_copy(update={"yaw_deg": (0, 0)}), VIEWS["frontal"]
-    settings = FaceSettings(light=light, view=view, backgrounds=("plain",))
-    head = faces.generate(1, 128, 4, settings)
-    photo, object_mask = torch.from_numpy(head.images[0]) / 255, torch.from_numpy(head.mask[0] > 0)
-    model = load("rendered-faces-64")
+    (photo, object_mask), model = drawn_head(), load("rendered-faces-64")
     scene = model.decompose(avg_pool2d(photo[None], 2))
     other = scene.with_parameters(light=torch.tensor([[0.2, 1.0, 0.0, 1.2]]))
     change = (PhotoDetail(photo, scene, model.fov_deg)(other).image[0] - photo).abs().mean(dim=0)
@@ -127,16 +131,11 @@ def test_new_light_leaves_what_is_behind_the_object():
 
 @pytest.mark.parametrize("degrees", [-30, 30])
 def test_a_head_that_turns_hides_its_far_side(degrees):
-    light, view = LIGHTS["frontal"].model_copy(update={"yaw_deg": (0, 0)}), VIEWS["frontal"]
-    drawn = [
-        torch.from_numpy(faces.generate(1, 128, 4, FaceSettings(light=light, view=turned)).images[0]) / 255
-        for turned in (view.model_copy(update={"yaw_deg": (yaw, yaw)}) for yaw in (0, degrees))
-    ]
-    model = load("rendered-faces-64")
-    scene = model.decompose(avg_pool2d(drawn[0], 2)[None])
+    (photo, _), (turned, _) = drawn_head(), drawn_head(degrees)
+    scene = load("rendered-faces-64").decompose(avg_pool2d(photo, 2)[None])
     camera = scene.camera + torch.tensor([0, math.radians(degrees), 0, 0, 0, 0])
-    seen = PhotoDetail(drawn[0], scene, FOV)(scene.with_parameters(camera=camera)).image[0]
-    assert (seen - drawn[1]).square().mean() < 0.4 * (drawn[0] - drawn[1]).square().mean()
+    seen = PhotoDetail(photo, scene, FOV)(scene.with_parameters(camera=camera)).image[0]
+    assert (seen - turned).square().mean() < 0.4 * (photo - turned).square().mean()
 
 
 def test_turned_there_and_back_it_is_the_photograph():
