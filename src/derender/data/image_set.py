@@ -11,7 +11,7 @@ With groups (identities), whole groups are ordered and cut: no person is on two 
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -178,7 +178,7 @@ class ImageSet:
 
 
 def read_images(
-    source: str | Path, image_size: int, *, dataset: str = "auto", subset: str | None = None,
+    source: str | Path | Stream, image_size: int, *, dataset: str = "auto", subset: str | None = None,
     fit: str = "crop", keep_duplicates: bool = False, limit: int | None = None,
     cache: str | Path | None = None, memory_limit_bytes: int = MEMORY_LIMIT_BYTES,
     workers: int | None = None, progress: Progress | None = None,
@@ -187,7 +187,7 @@ def read_images(
 
     Args:
         source: a folder, zip, image, table of paths, shards or Hugging Face data set, also ``PATH::SUBSET``
-            (data/opening.py).
+            (data/opening.py). Or an open stream, which stays open, and whose part and limit are its own.
         image_size: side of the square images, in pixels.
         dataset: the layout's name, or "auto" to recognise it.
         subset: a part of the data set ("train", "test_gt", a sub-folder); rendered sets: "train" by default.
@@ -205,8 +205,9 @@ def read_images(
     if limit is not None and limit < 1:
         raise ValueError(f"limit must be 1 or more, got {limit}")
     require_known("fit", fit, FITS)
+    how = {"dataset": dataset, "subset": subset, "limit": limit}
     with (
-        open_images(source, dataset=dataset, subset=subset, limit=limit) as stream,
+        nullcontext(source) if isinstance(source, Stream) else open_images(source, **how) as stream,
         closing(decoded(stream, image_size, fit=fit, workers=workers)) as chunks,
         quiet_pillow(),
     ):
@@ -231,7 +232,7 @@ def read_images(
             for row, pixels in enumerate(chain.from_iterable(kept())):
                 images[row] = pixels
             return _joined(stream, images[: len(result.rows)], result.content())
-        settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit)
+        settings = (READER_VERSION, stream.layout, image_size, fit, keep_duplicates, limit or stream.limit)
         made_of = repr((settings, PIL.__version__, stream.identity()))
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()
         name = re.sub(r"[^\w.-]+", "-", stream.source.rpartition("/")[2])[:40]  # for people

@@ -12,6 +12,7 @@ share v of the largest value is z = 1.1 - 0.2 v. The set does not state this; da
 import io
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from derender.data.layouts import layout_named
 from derender.data.layouts.faces import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
-from derender.data.opening import list_images, open_source, parse_source
+from derender.data.opening import ListedStream, open_images, open_source, parse_source
 from derender.data.source import Source, evenly_spaced
 from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
@@ -64,7 +65,7 @@ class GroundTruth:
 
 def read_masks(
     source: str | Path, image_size: int, *, masks: str | Path | None = None, dataset: str = "auto",
-    subset: str | None = None, fit: str = "crop", workers: int | None = None,
+    subset: str | None = None, limit: int | None = None, fit: str = "crop", workers: int | None = None,
     progress: Progress | None = None, **reading: Any,
 ) -> MaskedImages:  # fmt: skip
     """Read every image of a folder or zip with its mask, both at ``image_size`` x ``image_size``.
@@ -81,21 +82,22 @@ def read_masks(
             the aspect ratio of their images.
     """
     own = masks is None
-    listed = list_images(source, dataset=dataset, subset=subset) if own else None
-    files = listed.files if listed is not None else open_source(Path(masks or "").expanduser())
-    classes = len(MASK_CLASSES) if own else MOST_CLASSES
-    named = f"0 ({MASK_CLASSES[0]}) to {classes - 1} ({MASK_CLASSES[-1]})"
-    limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
-    with files:
-        if listed is not None:
-            if "mask" not in listed.table.labels:
-                raise ValueError(
-                    f"{files.path} holds no masks (it was read as {listed.layout}): expected images/NAME.jpg "
-                    "with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
-                )
-            _require_masks(files, listed.table.files, listed.table.labels["mask"].tolist())
-        how = {"dataset": dataset, "subset": subset, "fit": fit, "workers": workers, "progress": progress}
-        images = read_images(source, image_size, **how, **reading)
+    with ExitStack() as opened:
+        stream = opened.enter_context(open_images(source, dataset=dataset, subset=subset, limit=limit))
+        if not own:
+            files = opened.enter_context(open_source(Path(masks).expanduser()))
+        elif isinstance(stream, ListedStream) and "mask" in stream.table.labels:
+            files = stream.files
+            _require_masks(files, stream.table.files, stream.table.labels["mask"].tolist())
+        else:
+            raise ValueError(
+                f"{stream.source} holds no masks (it was read as {stream.layout}): expected images/NAME.jpg "
+                "with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
+            )
+        classes = len(MASK_CLASSES) if own else MOST_CLASSES
+        named = f"0 ({MASK_CLASSES[0]}) to {classes - 1} ({MASK_CLASSES[-1]})"
+        limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
+        images = read_images(stream, image_size, fit=fit, workers=workers, progress=progress, **reading)
         names = images.label("mask").tolist() if own else _named_alike(files, images.files)
         _require_masks(files, images.files, names)
         parts = parts_of(files) if own else {}

@@ -241,9 +241,8 @@ def doctor(
         source = images
         if Path(source).is_file() and is_image(str(source)):
             raise ValueError(f"{source} is one image: a set is examined as a whole, give its folder or zip")
-        how = {"dataset": dataset, "limit": limit, "keep_duplicates": True, "progress": progress}
-        images = read_images(source, EXAMINED_PX, **how)
-        with open_images(source, dataset=dataset) as stream:
+        with open_images(source, dataset=dataset, limit=limit) as stream:
+            images = read_images(stream, EXAMINED_PX, keep_duplicates=True, progress=progress)
             if isinstance(stream, ListedStream):
                 originals = measures.measure_originals(stream.files, images.files, EXAMINED_PX)
     if (count := len(images)) == 0:
