@@ -377,6 +377,7 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     "training-step": ("training_step.json", speed.training_step),
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "fitting": ("fitting.json", speed.fitting),
+    "disentangle-speed": ("disentangle.json", speed.before),
     "rasterize": ("rasterize.json", speed.rasterize),
     "peers": ("rasterize_peers.json", speed.peers),
     "step-memory": ("step_memory.json", speed.step_memory),

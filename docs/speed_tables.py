@@ -62,6 +62,15 @@ def fitting(result: Any) -> Iterator[list[str]]:
         yield [name, str(row["steps"]), f"{row['ms_per_image']:.1f}", *scores]
 
 
+def before(result: Any) -> Iterator[list[str]]:
+    yield ["`evaluate disentangle`, 400 images", "seconds", "least to most", "processor seconds", "ratio"]
+    first = result["rows"][0]["seconds"]
+    for row, name in zip(result["rows"], (f"commit {result['commit']}", "now"), strict=True):
+        ends = [f"{end(taken for taken, _ in row['rounds']):.0f}" for end in (min, max)]
+        cells = [f"{row['seconds']:.0f}", " to ".join(ends), f"{row['processor_seconds']:.0f}"]
+        yield [name, *cells, f"{first / row['seconds']:.2f}"]
+
+
 def gpu_steps(result: Any) -> Iterator[list[str]]:
     yield ["one GPU", "launched one by one, images/s", "CUDA graph, images/s", "ratio", "memory, GB"]
     for batch, rate in result["literal"].items():

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 import derender
-from derender.data import ImageSet
+from derender.data import ImageSet, as_batch
 from derender.inputs import as_images, as_model, device_named, part_of
 from derender.storage.folder import SplitRecord, write_split
 
@@ -40,6 +40,14 @@ def test_an_address_is_read_at_the_size_asked_for(tmp_path):
     assert len(as_images(tmp_path, 8, limit=2)) == 2
     with pytest.raises(ValueError, match="needs 4 images or more"):
         as_images(tmp_path, 8, at_least=4)
+
+
+def test_a_file_is_decoded_alike_alone_and_in_a_folder(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (900, 700, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "large.jpg")
+    alone = as_batch([str(tmp_path / "large.jpg"), noise], 32)
+    assert torch.equal(alone[0] * 255, torch.from_numpy(as_images(tmp_path, 32).images[0]).float())
+    assert alone.shape == (2, 3, 32, 32)
 
 
 def test_a_part_is_that_of_the_models_split(image_set, model):

@@ -282,6 +282,8 @@ def test_misfits_are_named(rendered, pairs, merged, tree, kind, name, content, m
 def test_depth_maps_of_another_size_fit_at_one_that_is_given(pairs):
     path = pairs(extra={DEPTH: png(ZERO[:6, :6] + 9)})
     assert read_ground_truth(path, image_size=6).depth.shape == (3, 6, 6)
+    with pytest.raises(ValueError, match=r"\?column= is for shards"):
+        read_ground_truth(f"{path}?column=depth", image_size=6)
 
 
 def test_missing_masks_images_and_lines_are_named(tree, published, merged):

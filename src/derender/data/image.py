@@ -276,9 +276,17 @@ def as_batch(
         check_images(images, size)
         refuse_values(images)
         return images.float()
-    squares = [fit_square(Image.fromarray(photo), size, "crop") for photo in as_photos(images)]
-    stacked = np.stack([np.asarray(square) for square in squares])
-    return torch.from_numpy(stacked).permute(0, 3, 1, 2).to(device).float() / 255
+    return torch.from_numpy(np.stack(_squares(images, size))).to(device).float() / 255
+
+
+def _squares(images: GivenImages, size: int) -> list[UInt8[np.ndarray, "3 s s"]]:
+    """Every image as models take it; a file as it is read from a folder."""
+    if isinstance(images, (str, Path)):
+        return [read_image(images, size)]
+    if isinstance(images, (list, tuple)) and images:
+        return [square for image in images for square in _squares(image, size)]
+    fitted = [fit_square(Image.fromarray(photo), size, "crop") for photo in as_photos(images)]
+    return [np.asarray(one).transpose(2, 0, 1) for one in fitted]
 
 
 def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:

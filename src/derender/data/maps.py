@@ -27,7 +27,7 @@ from derender.data.layouts import layout_named
 from derender.data.layouts.faces import MASK_CLASSES, parts_of
 from derender.data.layouts.layout import Labels, Table, half_of, stem_of
 from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
-from derender.data.opening import ListedStream, open_images, open_source, parse_source
+from derender.data.opening import ListedStream, half_named, open_images, open_source, parse_source
 from derender.data.source import Source, evenly_spaced
 from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
@@ -141,7 +141,7 @@ def read_ground_truth(
         pairs = {} if rendered_folders(opened) else pairs_of(opened)
         layout = layout_named("depth_pairs" if pairs else "synface")
         table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
-        table = half_of(table, options.get("half", "all"))
+        table = half_of(table, half_named(source, options))
         if pairs:
             chosen = [table.files[row] for row in evenly_spaced(len(table.files), limit)]
             return _read_pairs(opened, {file: pairs[file] for file in chosen}, image_size)

@@ -200,9 +200,7 @@ def list_images(
     subset = _only_part(source, part, subset)
     files = open_source(Path(place).expanduser())
     try:
-        half = options.pop("half", "all")
-        if options:
-            raise ValueError(f"{source}: ?{next(iter(options))}= is for shards and Hugging Face data sets")
+        half = half_named(source, options)
         layout = layout or recognise(files)
         table = half_of(layout.read(files, subset), half)
         if not table.files:
@@ -213,6 +211,13 @@ def list_images(
     if limit is not None and limit < len(table.files):
         table = table.select(evenly_spaced(len(table.files), limit))
     return ListedStream(files, layout, table, subset, half)
+
+
+def half_named(source: str | Path, options: dict[str, str]) -> str:
+    """The half of a set that its address asks for; an option of other kinds of sets is a ValueError."""
+    if others := sorted(options.keys() - {"half"}):
+        raise ValueError(f"{source}: ?{others[0]}= is for shards and Hugging Face data sets")
+    return options.get("half", "all")
 
 
 def open_source(path: Path) -> Source:

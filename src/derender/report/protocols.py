@@ -158,7 +158,7 @@ def search_sheet(
             if sample.file in missing:
                 missing.remove(sample.file)
                 with suppress(Unreadable, ValueError, OSError):
-                    read[sample.file] = decode(sample.read(), CELL, box=sample.box)
+                    read[sample.file] = decode(sample.read(), CELL, sample.fit, sample.box)
                 if progress is not None:
                     progress(len(read), len(captions))
             if not missing:

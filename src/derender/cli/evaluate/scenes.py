@@ -18,6 +18,8 @@ def geometry(
 
     Images: a rendered set (as from derender synth), or folders image/ and depth/ with PNGs side by side.
     """
+    if images.dataset != "auto":
+        raise ValueError("sets with depth are recognised by themselves: leave --dataset out")
     scores = scoring.measured(
         "geometry", trained.open(), images.address, limit=images.limit, fit_steps=fit_steps, seed=seed,
         resamples=resamples, batch_size=batch_size, cache=cache, doing="decomposing",

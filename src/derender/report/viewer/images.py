@@ -171,7 +171,7 @@ class Gallery:
             encoded = self._listed.files.read(file)
         except (ValueError, OSError) as problem:
             raise Refused(404, "the image of this row can no longer be read") from problem
-        return pixels_of(encoded, size, box)
+        return pixels_of(encoded, size, box, self._listed.fit)
 
     def close(self) -> None:
         if self._listed is not None:

@@ -154,9 +154,11 @@ def too_large() -> Refused:
     )
 
 
-def pixels_of(encoded: bytes, image_size: int, box: np.ndarray | None = None) -> UInt8[np.ndarray, "3 s s"]:
-    """Decode one image, cut to its centre square; ``Refused`` (413 or 415) if that is impossible."""
-    return _decoded(encoded, lambda: decode(encoded, image_size, box=box, pixel_limit=PIXEL_LIMIT))
+def pixels_of(
+    encoded: bytes, image_size: int, box: np.ndarray | None = None, fit: str = "crop"
+) -> UInt8[np.ndarray, "3 s s"]:
+    """Decode one image, by default its centre square; ``Refused`` (413 or 415) if that is impossible."""
+    return _decoded(encoded, lambda: decode(encoded, image_size, fit, box, PIXEL_LIMIT))
 
 
 def photo_of(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
