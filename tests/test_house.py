@@ -17,7 +17,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 BUDGET = {  # lines, files
     "data": (6_980, 30),
-    "evaluation": (7_285, 32),  # ridge regression in closed form
+    "evaluation": (7_300, 32),  # ridge regression in closed form
     "report": (3_970, 24),  # images that do not suit a model are left out
     "cli": (2_295, 32),  # the same
     "training": (3_590, 19),  # CUDA graphs; networks compiled if asked; the framing network
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (920, 5),
 }
-TOTAL = (39_209, 241)  # on the way to (37_000, 270)
-TEST_LINES = 26_144
+TOTAL = (39_223, 241)  # on the way to (37_000, 270)
+TEST_LINES = 26_160
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

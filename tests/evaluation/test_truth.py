@@ -9,7 +9,9 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
+import derender
 from derender.data import GroundTruth, read_ground_truth
+from derender.evaluation import scenes
 from derender.evaluation.truth import (
     albedo_error,
     evaluate_factors,
@@ -267,3 +269,17 @@ def test_a_model_that_knows_the_truth_scores_zero_and_constants_do_not():
         evaluate_factors(turned_model, replace(truth, camera=None))
     elsewhere = evaluate_factors(turned_model, truth).model
     assert elsewhere.camera < 1e-4 and elsewhere.light > 5
+
+
+def test_scenes_are_optimised_once_for_all_protocols(monkeypatch):
+    model, asked = derender.load("rendered-faces-64"), []
+    fit = type(model).fit_scenes
+    monkeypatch.setattr(type(model), "fit_scenes", lambda *given: asked.append(given) or fit(*given))
+    images, fitted = torch.rand(4, 3, 64, 64), scenes.optimised(model, 1)
+    first, again = fitted.decompose(images), fitted.decompose(images.clone())
+    assert len(asked) == 1 and torch.equal(first.depth, again.depth)
+    fitted.decompose(images.flip(0))
+    monkeypatch.setattr(scenes, "SCENES_KEPT", 0)
+    fitted.decompose(images[:2])
+    fitted.decompose(images[:2])
+    assert len(asked) == 4

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from derender.baselines.controls import untrained_twin
-from derender.data import GroundTruth, ImageSet, read_ground_truth
+from derender.data import GivenImages, GroundTruth, ImageSet, as_batch, read_ground_truth
 from derender.data.source import evenly_spaced
 from derender.evaluation.bootstrap import numbers_of
 from derender.evaluation.image_scores import ImageResult
+from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options
 from derender.evaluation.pixels import (
     COMPONENT_IMAGES,
@@ -31,7 +32,10 @@ from derender.evaluation.truth import FactorResult, GeometryResult, evaluate_fac
 from derender.features import Progress, embed_images, model_fingerprint
 from derender.inputs import as_images, as_model
 from derender.model import Derenderer
+from derender.scene import Scene
 
+SCENES_KEPT = 512 * 1024**2
+"""Bytes of images whose optimised scenes are kept while a model is scored."""
 Protocols = dict[str, tuple[type[ImageResult], Callable[[], Any]]]
 """By name the class of the result, and a call that makes it."""
 
@@ -125,12 +129,22 @@ def _scored(model: Derenderer, protocols: Protocols, inputs: Mapping[str, Any], 
 
 
 def optimised(model: Derenderer, steps: int | None) -> Derenderer:
-    """The model, or with steps one whose scenes are optimised per image."""
+    """The model, or with steps one whose scenes are optimised per image: once for all protocols that ask."""
     if not steps:
         return model
     model.features.required_fitting("this model")
+    known: dict[str, Scene] = {}
+
+    def decompose(images: GivenImages) -> Scene:
+        batch = as_batch(images, model.image_size, model.device)
+        key = content_hash({"images": batch.numpy(force=True)})
+        scene = known[key] if key in known else model.fit_scenes(batch, steps).scene
+        if len(known) * batch.nbytes < SCENES_KEPT:
+            known[key] = scene
+        return scene
+
     fitted = copy.copy(model)
-    fitted.decompose = lambda images: model.fit_scenes(images, steps).scene
+    fitted.decompose = decompose
     return fitted
 
 
