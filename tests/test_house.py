@@ -18,14 +18,14 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 BUDGET = {  # lines, files
     "data": (6_980, 30),
     "evaluation": (7_300, 32),  # ridge regression in closed form
-    "report": (3_970, 24),  # images that do not suit a model are left out
+    "report": (3_985, 24),  # images that do not suit a model are left out
     "cli": (2_295, 32),  # the same
-    "training": (3_590, 19),  # CUDA graphs; networks compiled if asked; the framing network
+    "training": (3_615, 19),  # CUDA graphs; networks compiled if asked; the framing network
     "baselines": (2_425, 11),
     "render": (1_705, 15),  # unwarp
     "features": (1_305, 8),  # a folder is refused before images are embedded
     "interpretation": (1_090, 5),  # maps of features of the canonical view, in crops
-    "photo": (1_680, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
+    "photo": (1_700, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
     "networks": (710, 5),
     "storage": (955, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,8 +35,8 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (920, 5),
 }
-TOTAL = (39_223, 241)  # on the way to (37_000, 270)
-TEST_LINES = 26_160
+TOTAL = (39_283, 241)  # on the way to (37_000, 270)
+TEST_LINES = 26_202
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -74,6 +74,20 @@ def test_what_does_not_suit_the_model_is_drawn_only_with_force(photos, tmp_path,
     assert "drawn all the same: 1 image" in printed and not result["refused"]
 
 
+def test_noise_is_left_out_though_its_grey_is_near_to_any(tmp_path, numbers, refused):
+    noise, out = (
+        np.random.default_rng(0).integers(0, 256, (300, 300, 3), dtype=np.uint8),
+        tmp_path / "lit.jpg",
+    )
+    Image.fromarray(noise).save(tmp_path / "noise.png")
+    words = ("relight", "-m", KNOWN, tmp_path / "noise.png", "-o", out)
+    line = refused(*words)
+    assert "no face is found; reconstructed worse than" in line and "fits better" not in line
+    assert "with 0 % of its variance explained" in line and not out.exists()
+    numbers(*words, "--force")
+    assert out.exists()
+
+
 def test_profiles_are_left_out_however_well_they_are_reconstructed(photos, tmp_path, numbers):
     view = {"yaw_deg": (70, 70), "yaw_sd_deg": None}
     settings = FaceSettings.model_validate({"view": view, "pictures_per_identity": 1})

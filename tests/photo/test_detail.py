@@ -49,6 +49,20 @@ def test_own_light_and_view_return_the_photograph(size, margin):
     assert (seen.image[0] - photo).abs().max() <= 1 / 255
 
 
+def test_a_visible_part_is_drawn_as_in_the_whole():
+    scene = bump()
+    photo, other = textured(scene), bump(light=(0.3, 0.8, 0.0, 0.6), camera=(0, 0.3, 0, 0, 0, 0))
+    visible = slice(20, 70), slice(30, 96)
+    part = PhotoDetail(photo, scene, FOV, visible=visible)(other)
+    whole = PhotoDetail(photo, scene, FOV)(other)
+    inner = (..., slice(32, 58), slice(42, 84))  # what is around it smooths the change of light at its border
+    assert (part.image[inner] - whole.image[inner]).abs().max() < 0.01
+    torch.testing.assert_close(part.depth[:, *visible], whole.depth[:, *visible])
+    outside = torch.ones(LARGE, LARGE, dtype=torch.bool)
+    outside[visible] = False
+    assert (part.image[0, :, outside] == photo[:, outside]).all()
+
+
 def over_exposed_skin() -> torch.Tensor:
     """(3, 1, 96, 96) skin, brighter to the right, past what can be shown; an eye's white on the left."""
     skin = torch.tensor([1.0, 0.8, 0.65])[:, None, None] * torch.linspace(0.4, 1.5, LARGE)

@@ -38,6 +38,18 @@ def test_a_turned_frame_has_its_corners_where_it_says(roll):
         assert np.abs(cut[:2, row, column].astype(float) - (x, y)).max() < 2
 
 
+@pytest.mark.parametrize("frame", [Frame(30, 20, 90), Frame(0, 20, 40), Frame(30, 15, 80, 30.0)])
+def test_what_is_visible_of_a_part_holds_all_that_shows_the_photograph(frame):
+    white = np.full((40, 60, 3), 255, np.uint8)
+    around = np.pad(white, ((200, 200), (200, 200), (0, 0)))  # black
+    hidden = Frame(frame.x + 200, frame.y + 200, frame.side, frame.roll_deg).cut(around, 60)
+    assert hidden.max() == 255
+    rows, columns = frame.visible(60, 40, 60)
+    hidden[:, rows, columns] = 0
+    assert hidden.max() == 0
+    assert (rows.stop - rows.start) * (columns.stop - columns.start) < 60 * 60
+
+
 @pytest.mark.parametrize("frame", [Frame(30, 20, 24), Frame(30.4, 20.7, 21.5, 25.0), Frame(2, 2, 30)])
 def test_an_unchanged_part_leaves_the_photograph_as_it_is(frame):
     photo = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)

@@ -66,11 +66,12 @@ class PhotoDetail:
         fov_deg: horizontal field of view.
         margin: how far the photograph reaches beyond that crop on every side, in shares of the crop's side.
         renderer: whose diffuse light multiplies the surface.
+        visible: rows and columns of the photograph that are drawn; the rest of it stays as it is.
     """
 
     def __init__(
         self, photo: Float[Tensor, "3 s s"], scene: Scene, fov_deg: float, margin: float = 0.0,
-        renderer: Renderer = LAMBERT,
+        renderer: Renderer = LAMBERT, visible: tuple[slice, slice] = (slice(None), slice(None)),
     ):  # fmt: skip
         if len(scene) != 1 or photo.ndim != 3 or photo.shape[-1] < scene.depth.shape[-1]:
             raise ValueError(
@@ -78,7 +79,7 @@ class PhotoDetail:
                 f"{tuple(photo.shape)} and {len(scene)} scenes of {scene.depth.shape[-1]} pixels"
             )
         self.photo, self.fov_deg, self.model_size = photo.to(scene.depth), fov_deg, scene.depth.shape[-1]
-        self.size, self.span = photo.shape[-1], 1 + 2 * margin
+        self.size, self.span, self.visible = photo.shape[-1], 1 + 2 * margin, visible
         self.grid = min(max(GRID, self.model_size), self.size)
         self.rim = round(margin * self.grid)
         self.reach = max(self.rim, round(REACH_SHARE * self.grid))
@@ -125,7 +126,8 @@ class PhotoDetail:
         veils = (inside * one for one in (own[:, 4:-1], mirrored[:, 4:-1], veil))
         faded, drawn = self._faded(ratio, inside) ** lit, colours * shading
         fields = (shift, mirror_shift, seen, mirror_seen, faded, mirror_ratio, drawn, *veils)
-        image, depth = self._composed(fields, doubts), self._enlarged(view.depth[:, None])[:, 0]
+        image, depth = self._composed(fields, doubts), self.photo.new_zeros(count, self.size, self.size)
+        depth[:, *self.visible] = self._enlarged(view.depth[:, None])[:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
     def _faded(self, ratio: Tensor, inside: Float[Tensor, "n 1 w w"]) -> Float[Tensor, "n 1 w w"]:
@@ -196,7 +198,9 @@ class PhotoDetail:
             drawn, doubts, seen, new = (field[part] for field in (drawn, doubts, seen, new))
             other = self._detailed(shift, ratio, drawn, doubts, veil, new, part)
             image[part] += weight * other + (1 - seen - weight) * _veiled(drawn, new)
-        return image.clamp(0, 1)
+        whole = self.photo.repeat(len(image), 1, 1, 1)
+        whole[..., *self.visible] = image.clamp(0, 1)
+        return whole
 
     def _detailed(
         self, shift: Tensor, ratio: Tensor, drawn: Tensor, doubts: Tensor, veil: Tensor, new: Tensor,
@@ -204,7 +208,7 @@ class PhotoDetail:
     ) -> Tensor:  # fmt: skip
         """The photograph looked up at shifted places, its shading changed, and its veil to the new one."""
         unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
-        own = _square((torch.arange(self.size) + 0.5) * 2 / self.size - 1).to(shift).permute(0, 3, 1, 2)
+        own = self._square_seen((torch.arange(self.size) + 0.5) * 2 / self.size - 1).permute(0, 3, 1, 2)
         places = (own[part] + unit * shift).permute(0, 2, 3, 1)
         lost = (self._lost,) if bool(self._lost.any()) else ()
         photo = torch.cat((self.photo[None], *lost), dim=1).expand(len(shift), -1, -1, -1)
@@ -226,11 +230,14 @@ class PhotoDetail:
         return self._enlarged(torch.cat(fields, dim=1)).split([field.shape[1] for field in fields], dim=1)
 
     def _enlarged(self, fields: Tensor) -> Tensor:
-        """Fields of the wide grid at the photograph's pixels."""
+        """Fields of the wide grid at the photograph's visible pixels."""
         places = ((torch.arange(self.size) + 0.5) / self.size - 0.5) * self.span * self.model_size
         across = places / (self.model_size - 1) * (self.grid - 1)  # from the middle, in grid pixels
-        centres = _square(across * 2 / (self.wide - 1)).to(fields).expand(len(fields), -1, -1, -1)
+        centres = self._square_seen(across * 2 / (self.wide - 1)).expand(len(fields), -1, -1, -1)
         return grid_sample(fields, centres, padding_mode="border", align_corners=True)
+
+    def _square_seen(self, along: Tensor) -> Float[Tensor, "1 r c 2"]:
+        return _square(along.to(self.photo))[:, *self.visible]
 
     def on_grid(
         self, image: Float[Tensor, "1 3 s s"], size: int, spread: float = 1.0

@@ -73,7 +73,8 @@ class Photograph:
         photo = torch.from_numpy(wide.cut(pixels, size)).to(scene.depth.device).float() / 255
         with torch.inference_mode():
             margin = (wide.side / frame.side - 1) / 2
-            detail = PhotoDetail(photo, scene, model.fov_deg, margin, model.renderer)
+            visible = wide.visible(pixels.shape[1], pixels.shape[0], size)
+            detail = PhotoDetail(photo, scene, model.fov_deg, margin, model.renderer, visible)
         return cls(pixels, frame, wide, scene, detail)
 
     def at_most(self, side: int) -> "Photograph":

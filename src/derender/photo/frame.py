@@ -20,6 +20,10 @@ GONE = 0.05
 """Change from which a moved thing's fine detail is gone from where it was."""
 
 
+BESIDE = 4
+"""Pixels around what is visible that are drawn as well: pixels between them are interpolated."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """A square in a photograph, perhaps turned, perhaps reaching beyond it.
@@ -76,6 +80,15 @@ class Frame:
         c, s = cos(angle), sin(angle)
         signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         return [(self.x + half * (c * u - s * v), self.y + half * (s * u + c * v)) for u, v in signs]
+
+    def visible(self, width: int, height: int, size: int) -> tuple[slice, slice]:
+        """Rows and columns, and few more, where this part at ``size`` x ``size`` shows the photograph."""
+        c, s = cos(radians(self.roll_deg)), sin(radians(self.roll_deg))
+        ends = [(x - self.x, y - self.y) for x in (0, width) for y in (0, height)]
+        places = np.array([(c * y - s * x, c * x + s * y) for x, y in ends]) / self.side + 0.5
+        low, high = places.min(axis=0) * size - BESIDE, places.max(axis=0) * size + BESIDE
+        first, last = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
+        return slice(first[0], last[0]), slice(first[1], last[1])
 
     def cut(self, photo: UInt8[np.ndarray, "h w 3"], size: int) -> UInt8[np.ndarray, "3 size size"]:
         """The part at ``size`` x ``size``, antialiased; beyond the photograph its border is continued."""

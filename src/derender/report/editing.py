@@ -231,7 +231,8 @@ def write_image_file(
     if out.exists() and not force:
         raise FileExistsError(f"{out} exists already: choose another --out, or add --force to replace it")
     with tempfile.TemporaryDirectory() as folder, atomic_file(out) as temporary:
-        written = write_images(opener, [image], Path(folder) / "images", edit, **{**how, "sheet": False})
+        how = {**how, "force": force, "sheet": False}
+        written = write_images(opener, [image], Path(folder) / "images", edit, **how)
         record = written.images[0]
         _copy_single(Path(record["folder"]), temporary, out)
     elsewhere = ("folder", "files", "stills", "out")  # of the record: files that are gone

@@ -27,10 +27,19 @@ from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.storage.atomic import DamageNoticed
 from derender.storage.places import model_folder
-from derender.training.held_out_errors import HeldOutErrors, read_errors, reconstruction_percentile
+from derender.training.held_out_errors import (
+    LEAST_EXPLAINED,
+    HeldOutErrors,
+    explained_variance,
+    read_errors,
+    reconstruction_percentile,
+)
 
 UNSUITABLE_PERCENTILE = 95.0
-"""Up to it an image is drawn in which no face is found: most generated heads are, few other objects."""
+"""Up to it, and from ``LEAST_EXPLAINED`` on, an image is drawn in which no face is found.
+
+Most generated heads are, few other objects.
+"""
 
 T = TypeVar("T")
 Read = tuple[np.ndarray, Frame, dict[str, Any], np.ndarray]
@@ -126,9 +135,11 @@ class ImageOpener:
         if faceless and self.held_out is not None:
             judged = np.stack([read[path][-1] for path in faceless])
             percentiles = reconstruction_percentile(self.model, judged, self.held_out)
-            for path, worse in zip(faceless, percentiles, strict=True):
+            shares = explained_variance(self.model, judged)
+            for path, worse, share in zip(faceless, percentiles, shares, strict=True):
                 doubts[path] += f"; reconstructed worse than {worse:.0f} % of the validation images"
-                if worse <= UNSUITABLE_PERCENTILE:
+                doubts[path] += f", with {100 * max(0, share):.0f} % of its variance explained"
+                if worse <= UNSUITABLE_PERCENTILE and share >= LEAST_EXPLAINED:
                     del doubts[path]
         return doubts
 

@@ -5,7 +5,7 @@ JSON file. An image with a high percentile shows another kind of object or anoth
 one proves nothing: a plain surface may be easy to render whatever it shows.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ FEWEST = 20  # of fewer images nothing is saved: their largest error says little
 OUTLIER_PERCENTILE = 99.0  # images above it are called out-of-distribution
 EXPECTED_OUTLIERS = 0.1  # share of the images that may be; of held-out ones 0.01 are
 FITTING = 90.0  # a model is recommended where images have such a percentile, or less
+LEAST_EXPLAINED = 0.1  # of an image's variance, or its low error says nothing: grey noise is near to any grey
 
 Images = UInt8[np.ndarray, "n 3 h w"] | UInt8[Tensor, "n 3 h w"]
 
@@ -40,17 +41,39 @@ def reconstruction_errors(model: Any, images: Images, batch_size: int = 64) -> F
 
     A NaN among the reconstructions raises `NotFinite`.
     """
+    errors = _of_reconstructions(masked_l1, model, images, batch_size)
+    if broken := int(np.isnan(errors).sum()):
+        which = f"the reconstructions of {broken} of {len(errors)} images"
+        raise NotFinite(f"{which} are NaN: the model's training went wrong")
+    return errors
+
+
+def explained_variance(model: Any, images: Images, batch_size: int = 64) -> Float[np.ndarray, " n"]:
+    """Share of each image's variance inside the mask that its reconstruction explains (R²): 1 at best.
+
+    0 or less where a plain colour is as near to the image, as to noise or a plain surface.
+    """
+    return _of_reconstructions(_explained, model, images, batch_size)
+
+
+def _explained(rendering: Any, target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
+    weight, image = rendering.mask.double()[:, None], target.double()
+    covered = weight.sum(dim=(2, 3), keepdim=True).clamp(min=1e-9)
+    away = image - (weight * image).sum(dim=(2, 3), keepdim=True) / covered
+    variance = (weight * away.square()).sum(dim=(1, 2, 3)).clamp(min=1e-9)
+    return 1 - (weight * (rendering.image - image).square()).sum(dim=(1, 2, 3)) / variance
+
+
+def _of_reconstructions(
+    measure: Callable[[Any, Tensor], Tensor], model: Any, images: Images, batch_size: int
+) -> Float[np.ndarray, " n"]:
     pixels = torch.as_tensor(np.array(images) if isinstance(images, np.ndarray) else images)
     parts = []
     with evaluating(model), torch.inference_mode():
         for batch in pixels.split(batch_size):
             target = as_float(batch.to(model.device))
-            parts.append(masked_l1(model.reconstruct(target), target).cpu())
-    errors = torch.cat(parts).numpy()
-    if broken := int(np.isnan(errors).sum()):
-        which = f"the reconstructions of {broken} of {len(errors)} images"
-        raise NotFinite(f"{which} are NaN: the model's training went wrong")
-    return errors
+            parts.append(measure(model.reconstruct(target), target).cpu())
+    return torch.cat(parts).numpy()
 
 
 def masked_l1(rendering: Any, target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, " n"]:
@@ -102,7 +125,9 @@ def fitting_better(images: Images, besides: Collection[str] = ()) -> str:
     results = []
     for name in set(bundled_models()).difference(besides):
         known, model = read_errors(model_folder(name)), load(name)
-        if known is not None and model.image_size == images.shape[-1]:
+        if known is None or model.image_size != images.shape[-1]:
+            continue
+        if np.median(explained_variance(model, images)) >= LEAST_EXPLAINED:
             results.append((float(np.median(reconstruction_percentile(model, images, known))), name))
     worse, best = min(results, default=(100.0, ""))
     if worse >= FITTING:

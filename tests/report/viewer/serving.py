@@ -1,5 +1,6 @@
 """A viewer that answers in a thread meanwhile."""
 
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Thread
@@ -14,6 +15,7 @@ def serving(application: Application) -> Iterator[str]:
     listener, server = listen("127.0.0.1", 0), server_for(application)
     thread = Thread(target=server.run, kwargs={"sockets": [listener]}, name="view-server")
     thread.start()
+    assert listener.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY), "answers would wait for an ACK"
     try:
         yield address_of(listener, "127.0.0.1")
     finally:

@@ -129,7 +129,9 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(host, port, flags=socket.AI_PASSIVE)[0]
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        return socket.create_server(address, family=family, backlog=128, dualstack_ipv6=both)
+        listener = socket.create_server(address, family=family, backlog=128, dualstack_ipv6=both)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # else a body waits for an ACK, 40 ms
+        return listener
     except socket.gaierror as problem:
         raise ValueError(f"host {host} is no address of this machine: use 127.0.0.1") from problem
     except OSError as problem:
