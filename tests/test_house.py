@@ -25,7 +25,7 @@ BUDGET = {  # lines, files
     "render": (1_705, 15),  # unwarp
     "features": (1_305, 8),  # a folder is refused before images are embedded
     "interpretation": (1_090, 5),  # maps of features of the canonical view, in crops
-    "photo": (1_700, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
+    "photo": (1_715, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
     "networks": (710, 5),
     "storage": (955, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
@@ -35,7 +35,7 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (920, 5),
 }
-TOTAL = (39_283, 241)  # on the way to (37_000, 270)
+TOTAL = (39_299, 241)  # on the way to (37_000, 270)
 TEST_LINES = 26_202
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

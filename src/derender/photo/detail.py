@@ -22,8 +22,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
+from derender.photo.frame import sampled
 from derender.render import Rendering, warp
 from derender.renderers import Renderer
 from derender.scene import Scene
@@ -193,8 +194,8 @@ class PhotoDetail:
         image = seen * self._detailed(shift, ratio, drawn, doubts, veil, new)
         if bool((unseen := (seen < 0.999).any(dim=0)[0]).any()):
             part = (..., *(slice(int(at.min()), int(at.max()) + 1) for at in unseen.nonzero().T))
-            mirrored = self._all_enlarged(mirror_shift, mirror_ratio, mirror_seen, mirror_veil)
-            shift, ratio, weight, veil = (field[part] for field in mirrored)
+            mirrored = self._all_enlarged(mirror_shift, mirror_ratio, mirror_seen, mirror_veil, part=part)
+            shift, ratio, weight, veil = mirrored
             drawn, doubts, seen, new = (field[part] for field in (drawn, doubts, seen, new))
             other = self._detailed(shift, ratio, drawn, doubts, veil, new, part)
             image[part] += weight * other + (1 - seen - weight) * _veiled(drawn, new)
@@ -208,11 +209,11 @@ class PhotoDetail:
     ) -> Tensor:  # fmt: skip
         """The photograph looked up at shifted places, its shading changed, and its veil to the new one."""
         unit = 2 * (self.model_size - 1) / (self.grid - 1) / self.model_size / self.span  # a grid pixel
-        own = self._square_seen((torch.arange(self.size) + 0.5) * 2 / self.size - 1).permute(0, 3, 1, 2)
-        places = (own[part] + unit * shift).permute(0, 2, 3, 1)
+        own = self._square_seen((torch.arange(self.size) + 0.5) * 2 / self.size - 1, part)
+        places = own + (unit * shift).permute(0, 2, 3, 1)
         lost = (self._lost,) if bool(self._lost.any()) else ()
         photo = torch.cat((self.photo[None], *lost), dim=1).expand(len(shift), -1, -1, -1)
-        result = grid_sample(photo, places, mode="bicubic", padding_mode="border", align_corners=False)
+        result = sampled(photo, places, mode="bicubic", padding_mode="border")
         result, lost = result[:, :3], result[:, 3:]
         if lost.shape[1]:
             result = result + lost * _ramp(-ratio, -1, -DARKER)
@@ -226,18 +227,19 @@ class PhotoDetail:
         surface = edited + torch.lerp(lit * _smooth(wrong, lit, DETAIL_SHARE * self.size), wrong, moved)
         return _veiled(surface.clamp(max=0).exp(), new) + beyond
 
-    def _all_enlarged(self, *fields: Tensor) -> tuple[Tensor, ...]:
-        return self._enlarged(torch.cat(fields, dim=1)).split([field.shape[1] for field in fields], dim=1)
+    def _all_enlarged(self, *fields: Tensor, part: tuple[Any, ...] = (...,)) -> tuple[Tensor, ...]:
+        sizes = [field.shape[1] for field in fields]
+        return self._enlarged(torch.cat(fields, dim=1), part).split(sizes, dim=1)
 
-    def _enlarged(self, fields: Tensor) -> Tensor:
-        """Fields of the wide grid at the photograph's visible pixels."""
+    def _enlarged(self, fields: Tensor, part: tuple[Any, ...] = (...,)) -> Tensor:
+        """Fields of the wide grid at the photograph's visible pixels, or a part of these."""
         places = ((torch.arange(self.size) + 0.5) / self.size - 0.5) * self.span * self.model_size
         across = places / (self.model_size - 1) * (self.grid - 1)  # from the middle, in grid pixels
-        centres = self._square_seen(across * 2 / (self.wide - 1)).expand(len(fields), -1, -1, -1)
-        return grid_sample(fields, centres, padding_mode="border", align_corners=True)
+        centres = self._square_seen(across * 2 / (self.wide - 1), part).expand(len(fields), -1, -1, -1)
+        return sampled(fields, centres, padding_mode="border", align_corners=True)
 
-    def _square_seen(self, along: Tensor) -> Float[Tensor, "1 r c 2"]:
-        return _square(along.to(self.photo))[:, *self.visible]
+    def _square_seen(self, along: Tensor, part: tuple[Any, ...]) -> Float[Tensor, "1 r c 2"]:
+        return _square(along.to(self.photo))[:, *self.visible][(*part, slice(None))]
 
     def on_grid(
         self, image: Float[Tensor, "1 3 s s"], size: int, spread: float = 1.0
@@ -248,7 +250,7 @@ class PhotoDetail:
             image = interpolate(image, (side, side), mode="bilinear", antialias=True)
         edge = spread * (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
-        result = grid_sample(image, centres, mode="bicubic", padding_mode="border", align_corners=False)
+        result = sampled(image, centres, mode="bicubic", padding_mode="border")
         return result.clamp(0, 1)
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
@@ -322,7 +324,7 @@ def _cleared(image: Tensor, veil: Tensor) -> Tensor:
 def _look_up(maps: Tensor, place: Float[Tensor, "n 2 h w"], mode: str = "bilinear") -> Tensor:
     """Maps at pixel coordinates."""
     grid = place.permute(0, 2, 3, 1) * 2 / (maps.shape[-1] - 1) - 1
-    return grid_sample(maps, grid, mode=mode, padding_mode="border", align_corners=True)
+    return sampled(maps, grid, mode=mode, padding_mode="border", align_corners=True)
 
 
 def _facing(points: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n h w"]:

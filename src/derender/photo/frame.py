@@ -6,12 +6,13 @@ Leaves out finding it (faces.py, scene/crop.py).
 from dataclasses import dataclass
 from math import ceil, cos, radians, sin
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d
+from torch.nn.functional import grid_sample
 
 BORDER_SHARE = 1 / 16
 """Width over which an edited crop fades into its photograph, of the crop's side."""
@@ -21,7 +22,7 @@ GONE = 0.05
 
 
 BESIDE = 4
-"""Pixels around what is visible that are drawn as well: pixels between them are interpolated."""
+"""Pixels around what is visible that are drawn as well, at least; in such steps, for threads to share."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ class Frame:
         c, s = cos(radians(self.roll_deg)), sin(radians(self.roll_deg))
         ends = [(x - self.x, y - self.y) for x in (0, width) for y in (0, height)]
         places = np.array([(c * y - s * x, c * x + s * y) for x, y in ends]) / self.side + 0.5
-        low, high = places.min(axis=0) * size - BESIDE, places.max(axis=0) * size + BESIDE
+        low = np.floor(places.min(axis=0) * size / BESIDE - 1) * BESIDE
+        high = np.ceil(places.max(axis=0) * size / BESIDE + 1) * BESIDE
         first, last = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
         return slice(first[0], last[0]), slice(first[1], last[1])
 
@@ -134,16 +136,28 @@ class Frame:
             (cos(angle) * u + sin(angle) * v, cos(angle) * v - sin(angle) * u), dim=-1
         )[None].float()  # fmt: skip
         both = torch.cat((change, before[None].cpu()), dim=1)
-        both = grid_sample(both, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        both = sampled(both, grid, padding_mode="zeros")
         added, old = both.split(3, dim=1)
         pasted = photo.copy()
         region = torch.from_numpy(photo[top:bottom, left:right].astype(np.float32) / 255).permute(2, 0, 1)
         if moved:
-            gone = (max_pool2d(added.abs().amax(dim=1), 3, stride=1, padding=1) / GONE).clamp(0, 1)
+            most = cv2.dilate(added[0].abs().amax(dim=0).numpy(), np.ones((3, 3)))
+            gone = (torch.from_numpy(most) / GONE).clamp(0, 1)
             added = added + gone * (old - region)
         edited = (255 * (region + added[0])).round().clamp(0, 255)
         pasted[top:bottom, left:right] = edited.permute(1, 2, 0).to(torch.uint8).numpy()
         return pasted
+
+
+def sampled(
+    maps: Float[Tensor, "n c h w"], places: Float[Tensor, "n r k 2"], align_corners: bool = False, **how: str
+) -> Float[Tensor, "n c r k"]:
+    """`torch.nn.functional.grid_sample`, whose threads share images: of a single one each takes some rows."""
+    threads, rows = torch.get_num_threads(), places.shape[1]
+    if len(maps) > 1 or rows % threads:
+        return grid_sample(maps, places, align_corners=align_corners, **how)
+    bands, maps = places.unflatten(1, (threads, -1))[0], maps.expand(threads, -1, -1, -1)
+    return grid_sample(maps, bands, align_corners=align_corners, **how).transpose(0, 1).flatten(1, 2)[None]
 
 
 def _window(size: int) -> Float[Tensor, "s s"]:
