@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from filelock import FileLock
 from PIL import Image
 from tests.features.conftest import assert_same
 
@@ -19,6 +20,7 @@ from derender.features import FeatureTable, embed_image_set, embedding
 from derender.features.blocks import BlockEmbedder
 from derender.features.embedding import embed_to_file
 from derender.storage.atomic import DamageNoticed
+from derender.training.process import LOCK_FILE
 
 COUNT = 110
 
@@ -188,6 +190,8 @@ def test_parts_of_another_run_are_an_error_until_told(model, source, tmp_path, o
     model.b[0, 0] += 1
     with pytest.raises(ValueError, match=r"differs in origin.*add --force"):
         streamed(model, source, out)
+    with FileLock(f"{out}.partial/{LOCK_FILE}"), pytest.raises(ValueError, match="by another process"):
+        streamed(model, source, out, fresh=True)
     assert streamed(model, source, out, fresh=True).resumed == 0
     assert_same(FeatureTable.read(out), in_memory(model, source, tmp_path / "m.parquet"))
 

@@ -34,7 +34,7 @@ from derender.features.table import FeatureTable, check_finite
 from derender.storage.atomic import Damaged, DamageNoticed, atomic_file, measured, write_whole
 from derender.storage.bounded import parse_json, read_json
 from derender.storage.places import optional
-from derender.training.process import evaluating
+from derender.training.process import LOCK_FILE, evaluating
 
 OpenStream = Callable[[], AbstractContextManager[Stream]]  # opens the stream anew, in whatever process
 Block = tuple[list[Decoded], Mapping[str, np.ndarray]]
@@ -145,7 +145,13 @@ def ray_blocks(
 
 PLAN, PARTS_FORMAT = "plan.json", 2
 _KEY = b"derender part"
-_BEGUN = (PLAN, f".{PLAN}", "writing.parquet", ".writing.parquet")  # of a run killed before its first part
+_BEGUN = (
+    LOCK_FILE,
+    PLAN,
+    f".{PLAN}",
+    "writing.parquet",
+    ".writing.parquet",
+)  # of a run killed before its first part
 
 Rows = tuple[pa.Table, Mapping[str, Any]]
 """Rows of an unfinished table, and what else is known: the first sample ``following``, unreadable images
@@ -231,7 +237,9 @@ class Parts:
                 f"{self.folder} holds an unfinished table {how}: delete that folder, or add --force to "
                 "begin anew"
             )
-        self.remove()
+        for entry in self.folder.iterdir():
+            if entry.name != LOCK_FILE:
+                entry.unlink()
 
     def _add(self, file: Path, rows: int, note: Mapping[str, Any]) -> None:
         self.files.append(file)

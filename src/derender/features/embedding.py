@@ -27,6 +27,7 @@ from derender.features.table import FeatureTable
 from derender.inputs import Progress, as_images, as_model
 from derender.storage.places import counted, model_folder, require_known
 from derender.training.held_out_errors import read_errors, reconstruction_percentile, unlike
+from derender.training.process import locked
 
 PART_ROWS = 4096  # a part is written when this many rows are there
 LISTED_SKIPPED = 20  # so many unreadable images are named; all are counted
@@ -109,7 +110,8 @@ def embed_to_file(
         progress: called with (images done, estimated total) after every batch.
 
     Raises:
-        ValueError: no image can be read, a feature is not finite, or the parts are of another run.
+        ValueError: no image can be read, a feature is not finite, the parts are of another run, or another
+            process writes them.
         KeyboardInterrupt: it was stopped; the message says what is kept.
     """
     path = Path(out)
@@ -137,7 +139,10 @@ def embed_to_file(
         assert isinstance(images, Stream | ImageSet)
         facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
         plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
-        parts = Parts(path.with_name(f"{path.name}.partial"), plan, fresh=fresh)
+        folder = path.with_name(f"{path.name}.partial")
+        if folder.is_dir() or not folder.exists():
+            stack.enter_context(locked(folder))
+        parts = Parts(folder, plan, fresh=fresh)
         resumed, start = parts.rows, parts.following
         options = {"batch_size": batch_size, "fit": fit}
         if engine == "ray":
