@@ -42,7 +42,8 @@ def train(
 
     changes = [*(settings or ()), *([] if generator is None else [f"generator={generator}"])]
     config = learn.run_settings(out, settings=changes, **vars(chosen))
-    if chosen.preset is None and not chosen.resume and getattr(config, "preset", "") == "small":
+    asked = chosen.preset or chosen.config or chosen.resume
+    if not asked and getattr(config, "preset", "") == "small":
         notice("preset small: there is no graphics card; faces has 16 times the work (--preset faces)")
     if chosen.start_from is not None and chosen.preset is not None:
         how = f"preset {chosen.preset} says how it is trained"
