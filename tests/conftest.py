@@ -46,6 +46,24 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+def made_smallest():
+    """An untrained model of the smallest kind, for 32 pixels."""
+    from derender import Derenderer  # late: its types are checked from when pytest is set up
+
+    return Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
+
+
+@pytest.fixture
+def smallest():
+    return made_smallest()
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory) -> Path:
+    """The smallest model, saved."""
+    return made_smallest().save(tmp_path_factory.mktemp("tiny") / "model")
+
+
 @pytest.fixture(autouse=True)
 def _restore_determinism():
     """A run with ``deterministic=true`` leaves torch as it was."""

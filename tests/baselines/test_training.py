@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from tests.baselines.conftest import OWN, config, generator_of
+from tests.training.conftest import assert_same_weights, weights
 
 import derender
 from derender.baselines import load_baseline, network_type, read_any_config, train_baseline
@@ -17,7 +18,6 @@ from derender.features import embed_image_set
 from derender.overrides import checked
 from derender.report.run import baseline_sheet, run_page
 from derender.training import resolve, train
-from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.run_folder import read_config, read_metrics
 
 
@@ -25,10 +25,6 @@ from derender.training.run_folder import read_config, read_metrics
 def copy(runs, tmp_path):
     """A saved model, to be changed."""
     return shutil.copytree(runs / "ae" / "model", tmp_path / "copy")
-
-
-def weights(run, which: str = "last") -> dict[str, torch.Tensor]:
-    return load_file(run / "checkpoints" / which / WEIGHTS_FILE)
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -53,8 +49,7 @@ def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, ru
 
     train_baseline(config(name, 24, *generator), blobs, tmp_path / "parts")
     train_baseline(config(name, 48, *generator), blobs, tmp_path / "parts", resume=True)
-    whole, parts = weights(run), weights(tmp_path / "parts")
-    assert whole.keys() == parts.keys() and all(torch.equal(whole[key], parts[key]) for key in whole)
+    assert_same_weights(run, tmp_path / "parts")
     with pytest.raises(ValueError, match="was trained with another seed"):
         train_baseline(config(name, 72, "seed=3", *generator), blobs, tmp_path / "parts", resume=True)
 

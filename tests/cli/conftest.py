@@ -1,4 +1,4 @@
-"""What tests of commands share: words of any kind, refusals, the smallest model and generated faces."""
+"""What tests of commands share: words of any kind, refusals and generated faces."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender import Derenderer
 from derender.cli import main
 from derender.data.synthetic.faces import generate
 
@@ -22,6 +21,9 @@ def run(*words: object) -> int:
 def settings(*pairs: str) -> list[str]:
     """``--set`` before each."""
     return [word for pair in pairs for word in ("--set", pair)]
+
+
+SETTINGS = ["--preset", "small", *settings(*TINY, "batch_size=4", "images=8")]
 
 
 def noise(folder: Path, count: int, size: int = 32, cells: int = 4, name: str = "{}.png") -> Path:
@@ -81,15 +83,16 @@ def refused(capsys):
 
 
 @pytest.fixture(scope="session")
-def tiny(tmp_path_factory) -> Path:
-    """An untrained model of the smallest kind, for 32 pixels, saved."""
-    made = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    return made.save(tmp_path_factory.mktemp("tiny") / "model")
-
-
-@pytest.fixture(scope="session")
 def faces(tmp_path_factory) -> Path:
     """Forty generated faces with ground truth, as `synth faces` writes them."""
     folder = tmp_path_factory.mktemp("made") / "faces"
     assert run("synth", "faces", "--out", folder, "--count", 40, "--image-size", 32) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained(faces: Path, tmp_path_factory) -> Path:
+    """A run folder of a training that lasted two steps."""
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    assert run("train", "--data", faces, "--out", folder, *SETTINGS) == 0
     return folder

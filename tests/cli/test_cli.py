@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
-from tests.cli.conftest import TINY, run, settings
+from tests.cli.conftest import SETTINGS, run
 
 from derender import FeatureTable
 from derender.cli import console, main
@@ -27,15 +27,6 @@ COMMANDS = (
     *("relight", "rotate", "swap", "mesh", "search", "view"),
     *("cluster", "linear", "disentangle", "geometry", "reconstruction"),
 )
-SETTINGS = ["--preset", "small", *settings(*TINY, "batch_size=4", "images=8")]
-
-
-@pytest.fixture(scope="module")
-def trained(faces: Path, tmp_path_factory) -> Path:
-    """A run folder of a training that lasted two steps."""
-    folder = tmp_path_factory.mktemp("cli") / "run"
-    assert run("train", "--data", faces, "--out", folder, *SETTINGS) == 0
-    return folder
 
 
 def imported_by(*arguments: str | Path, among: tuple[str, ...]) -> tuple[int, str, str]:
@@ -205,6 +196,8 @@ def test_nothing_is_written_over(trained, faces, refused, tmp_path):
     assert "--force" in refused("embed", "-m", trained, "-d", faces, "--out", there)
     assert there.read_text() == "mine"
     assert "is a folder" in refused("embed", "-m", trained, "-d", faces, "--out", tmp_path)
+    assert "parquet" in refused("embed", "-m", trained, "-d", faces, "--out", tmp_path / "features.csv")
+    assert [file.name for file in tmp_path.iterdir()] == ["there.parquet"]
 
 
 def test_missing_and_damaged_models(trained, faces, refused, tmp_path):
@@ -275,12 +268,6 @@ def test_every_bundled_model_is_listed_with_what_it_was_trained_on(numbers):
     for row in rows:
         assert row["image_size"] == int(row["name"].rsplit("-")[-1]) and 5 < row["megabytes"] < 30
         assert row["about"].startswith("Trained on ") and len(row["about"]) < 90
-
-
-def test_a_feature_table_in_another_format_is_refused(refused, tmp_path):
-    out = tmp_path / "features.csv"
-    assert "parquet" in refused("embed", tmp_path, "--model", "faces-64", "--out", out)
-    assert not out.exists()
 
 
 def test_a_shell_is_given_completions(monkeypatch, capsys):

@@ -51,8 +51,9 @@ def test_the_card_is_printed_drawn_and_written(model, rendered, tmp_path, number
 
 
 def test_bad_words(model, rendered, tmp_path, refused):
+    printed = refused("evaluate", "brightness", "-m", model, "-d", rendered / "images")
+    assert "for photographs name a label of groups (--by LABEL)" in printed
     refused = partial(refused, "evaluate", "disentangle", "-m", model, "-d", rendered)
-
     assert "must end in .png" in refused("--out", tmp_path / "card.jpg")
     taken = tmp_path / "taken.png"
     taken.write_bytes(b"mine")
@@ -86,11 +87,6 @@ def test_a_rendered_set_of_another_size_is_refused_with_what_to_do(protocol, ren
     printed = refused("evaluate", protocol, "-m", "rendered-faces-64", "-d", rendered)
     assert "the images are 32x32, the model takes 64x64: render the set at that size" in printed
     assert "--image-size 64" in printed and "or give another model" in printed
-
-
-def test_brightness_of_photographs_asks_for_groups(model, rendered, refused):
-    printed = refused("evaluate", "brightness", "-m", model, "-d", rendered / "images")
-    assert "for photographs name a label of groups (--by LABEL)" in printed
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,13 @@
 """`derender embed` on folders and streams: what it says, what it leaves after Ctrl-C, and how it goes on."""
 
-import io
 import json
-import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from tests.cli.conftest import run
+from tests.data.conftest import encode, noise
+from tests.data.stream.conftest import write_shard
 
 from derender import Derenderer, FeatureTable
 from derender.data import stream as decoding
@@ -21,17 +20,11 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def shards(folder: Path, count: int = 20) -> str:
-    folder.mkdir(exist_ok=True)
     for number in range(2):
-        with tarfile.open(folder / f"s-{number}.tar", "w") as tar:
-            for row in range(number * count // 2, (number + 1) * count // 2):
-                buffer = io.BytesIO()
-                pixels = np.random.default_rng(row).integers(0, 256, (32, 32, 3), dtype=np.uint8)
-                Image.fromarray(pixels).save(buffer, "PNG")
-                for name, data in ((f"{row}.png", buffer.getvalue()), (f"{row}.cls", str(row % 2).encode())):
-                    info = tarfile.TarInfo(name)
-                    info.size = len(data)
-                    tar.addfile(info, io.BytesIO(data))
+        members = {}
+        for row in range(number * count // 2, (number + 1) * count // 2):
+            members |= {f"{row}.png": encode(noise(row, 32, 32)), f"{row}.cls": str(row % 2)}
+        write_shard(folder / f"s-{number}.tar", members)
     return str(folder / "s-{0..1}.tar")
 
 

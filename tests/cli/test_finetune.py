@@ -2,9 +2,7 @@
 
 import json
 import shutil
-from pathlib import Path
 
-import pytest
 import yaml
 from PIL import Image
 from tests.cli.conftest import TINY, run, settings
@@ -15,17 +13,9 @@ from derender.inputs import split_of
 STEPS = ["images=16", "batch_size=8"]
 
 
-@pytest.fixture(scope="module")
-def begun(faces, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("finetune") / "run"
-    words = ["train", "--preset", "small", "--data", faces, "--out", folder]
-    assert run(*words, *settings(*TINY, *STEPS)) == 0
-    return folder
-
-
-def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refused):
+def test_from_a_run_to_features_and_scores(trained, faces, tmp_path, capsys, refused):
     out, numbers = tmp_path / "tuned", tmp_path / "numbers.json"
-    words = ["finetune", "-m", begun, "-d", faces, "--label", "expression", "--out", out]
+    words = ["finetune", "-m", trained, "-d", faces, "--label", "expression", "--out", out]
     split = settings("images=16", "split=[0.6, 0.2, 0.2]")
     words += ["--labelled", 20, "--weight", 2, *split, "--json", numbers]
     text, typeset, page = (tmp_path / f"scores.{form}" for form in ("md", "tex", "html"))
@@ -43,8 +33,8 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
     assert "<table" in page.read_text()
     assert told["kind"] == "classes" and told["n_train"] == 20
     config = yaml.safe_load((out / "config.yaml").read_text())
-    assert config["start"] == str(begun) and config["target"]["weight"] == 2
-    assert config["batch_size"] == 8 and config["model"]["network"]["width"] == 4
+    assert config["start"] == str(trained) and config["target"]["weight"] == 2
+    assert config["batch_size"] == 4 and config["model"]["network"]["width"] == 4
     assert (out / "report.html").is_file()
     table = tmp_path / "t.parquet"
     assert run("embed", "-m", out, "-d", faces, "--part", "test", "--out", table) == 0
@@ -68,7 +58,7 @@ def test_from_a_run_to_features_and_scores(begun, faces, tmp_path, capsys, refus
         Image.eval(Image.open(file), lambda level: 255 - level).save(file)
     assert "not on these 40" in refused("finetune", "-d", moved, *resume[2:], out)
     assert "continue with derender finetune --resume" in refused("train", *resume, out)
-    assert "continue with derender train --resume" in refused("finetune", *resume, begun)
+    assert "continue with derender train --resume" in refused("finetune", *resume, trained)
 
 
 def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
@@ -81,14 +71,16 @@ def test_from_fresh_weights_by_labels_alone(faces, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["target"]["factors"] == ["albedo", "light"]
 
 
-def test_bad_words_are_one_line(begun, faces, tmp_path, refused):
+def test_bad_words_are_one_line(trained, faces, tmp_path, refused):
     tune = ("finetune", "-d", faces, "--out", tmp_path / "out")
     assert "give either labels or attributes" in refused(*tune)
     assert "give either labels or attributes" in refused(*tune, "-l", "expression", "--attributes")
     assert "no yes/no label" in refused(*tune, "--attributes", "--preset", "small", *settings(*TINY))
-    assert "give one of them" in refused(*tune, "-m", begun, "--preset", "small", "-l", "expression")
-    assert "no label 'expresion'; did you mean 'expression'" in refused(*tune, "-m", begun, "-l", "expresion")
-    from_run = (*tune, "-m", begun, "-l", "expression")
+    assert "give one of them" in refused(*tune, "-m", trained, "--preset", "small", "-l", "expression")
+    assert "no label 'expresion'; did you mean 'expression'" in refused(
+        *tune, "-m", trained, "-l", "expresion"
+    )
+    from_run = (*tune, "-m", trained, "-l", "expression")
     assert "leave out settings of model.network" in refused(*from_run, *settings("model.network.width=8"))
     assert "target.weight" in refused(*from_run, "--weight", "-1")
     assert "no run to resume" in refused(*tune, "--resume")
@@ -96,4 +88,4 @@ def test_bad_words_are_one_line(begun, faces, tmp_path, refused):
     there = tmp_path / "there"
     there.mkdir()
     (there / "thesis.txt").write_text("mine")
-    assert "is not empty" in refused(*tune[:3], "--out", there, "-l", "expression", "-m", begun)
+    assert "is not empty" in refused(*tune[:3], "--out", there, "-l", "expression", "-m", trained)

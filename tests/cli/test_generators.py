@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tests.cli.conftest import run, settings
+from tests.cli.conftest import noise, run, settings
 
 from derender import FeatureTable
 
@@ -17,14 +17,11 @@ ENCODER = ["image_size=32", "width=4", "units=[1,1,1,1]", "perceptual_weight=0"]
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory) -> Path:
     """24 images, and for each a mask whose upper third is class 1."""
-    folder, random = tmp_path_factory.mktemp("generators") / "faces", np.random.default_rng(0)
-    mask = np.zeros((32, 32), np.uint8)
+    folder, mask = tmp_path_factory.mktemp("generators") / "faces", np.zeros((32, 32), np.uint8)
     mask[:10] = 1
-    for name in ("images", "masks"):
-        (folder / name).mkdir(parents=True)
+    noise(folder / "images", 24, name="{:02d}.png")
+    (folder / "masks").mkdir()
     for index in range(24):
-        picture = random.integers(0, 256, (4, 4, 3), dtype=np.uint8)
-        Image.fromarray(picture).resize((32, 32)).save(folder / "images" / f"{index:02d}.png")
         Image.fromarray(mask).save(folder / "masks" / f"{index:02d}.png")
     (folder / "masks" / "classes.txt").write_text("skin\nhair\n")
     return folder

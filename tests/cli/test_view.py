@@ -15,17 +15,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from tests.cli.conftest import noise
+from tests.cli.conftest import noise, run
 
 from derender import Derenderer
-from derender.cli import main
 
 SIZE = 32
-
-
-@pytest.fixture(scope="module")
-def model(tiny) -> str:
-    return str(tiny)
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +40,12 @@ def served(monkeypatch):
     return results
 
 
-def test_a_model_that_cannot_fit_scenes_is_told_how_it_could(model, refused):
-    message = refused("view", "--model", model, "--fit-steps", 5)
-    assert "cannot optimise scenes per image yet: derender whiten" in message
-
-
-def test_it_listens_on_this_machine_only(model, photos, served, tmp_path, capsys):
+def test_it_listens_on_this_machine_only(tiny, photos, served, tmp_path, capsys):
     table, told = tmp_path / "F.parquet", tmp_path / "told.json"
-    assert main(["embed", "-m", model, "-d", str(photos), "-o", str(table)]) == 0
+    assert run("embed", "-m", tiny, "-d", photos, "-o", table) == 0
     (photos / "no.jpg").write_text("<html>")
-    words = ["view", "-m", model, str(photos / "0.png"), str(photos / "no.jpg"), "-f", str(table)]
-    assert main([*words, "--json", str(told), "--keep", "7"]) == 0
+    words = ("view", "-m", tiny, photos / "0.png", photos / "no.jpg", "-f", table)
+    assert run(*words, "--json", told, "--keep", 7) == 0
     (application, place) = served[0]
     assert place[0] == "127.0.0.1"
     studio = application.studio
@@ -70,29 +59,28 @@ def test_it_listens_on_this_machine_only(model, photos, served, tmp_path, capsys
     (photos / "no.jpg").unlink()
 
 
-def test_listening_elsewhere_is_warned_of(model, photos, served, capsys):
-    assert main(["view", "-m", model, str(photos / "0.png"), "--host", "0.0.0.0"]) == 0
+def test_listening_elsewhere_is_warned_of(tiny, photos, served, capsys):
+    assert run("view", "-m", tiny, photos / "0.png", "--host", "0.0.0.0") == 0
     assert served[0][1][0] == "0.0.0.0"
     assert "no password" in capsys.readouterr().err
 
 
-def test_a_port_in_use_is_one_error(model, refused):
+def test_what_is_refused(tiny, photos, refused, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        line = refused("view", "-m", model, "--port", port)
+        line = refused("view", "-m", tiny, "--port", port)
     assert f"port {port} of 127.0.0.1 is in use: choose another port" in line
-
-
-def test_what_is_refused(model, photos, refused, tmp_path):
-    assert "no address of this machine" in refused("view", "-m", model, "--host", "no such host")
-    assert "0..65535" in refused("view", "-m", model, "--port", 70_000)
-    assert "does not exist" in refused("view", "-m", model, tmp_path / "none.png")
+    message = refused("view", "-m", tiny, "--fit-steps", 5)
+    assert "cannot optimise scenes per image yet: derender whiten" in message
+    assert "no address of this machine" in refused("view", "-m", tiny, "--host", "no such host")
+    assert "0..65535" in refused("view", "-m", tiny, "--port", 70_000)
+    assert "does not exist" in refused("view", "-m", tiny, tmp_path / "none.png")
     assert "no model at" in refused("view", "-m", tmp_path / "none")
     other = Derenderer.from_preset("small", seed=1, image_size=SIZE, width=4, light_width=4)
     other.save(tmp_path / "other")
     table = tmp_path / "F.parquet"
-    assert main(["embed", "-m", str(tmp_path / "other"), "-d", str(photos), "-o", str(table)]) == 0
-    assert "made by another model" in refused("view", "-m", model, "-f", table)
+    assert run("embed", "-m", tmp_path / "other", "-d", photos, "-o", table) == 0
+    assert "made by another model" in refused("view", "-m", tiny, "-f", table)
 
 
 @contextmanager
@@ -110,8 +98,8 @@ def viewing(told: Path, *words: object) -> Iterator[str]:
     assert message.strip() == "stopped"
 
 
-def test_it_answers_until_ctrl_c(model, photos, tmp_path):
-    with viewing(tmp_path / "told.json", "-m", model, photos / "1.png") as url:
+def test_it_answers_until_ctrl_c(tiny, photos, tmp_path):
+    with viewing(tmp_path / "told.json", "-m", tiny, photos / "1.png") as url:
         with urllib.request.urlopen(url, timeout=60) as page:
             assert b"relight and turn a photograph" in page.read()
         foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})

@@ -37,20 +37,24 @@ def tree(tmp_path: Path) -> Callable[..., Path]:
         files: list[str] | dict[str, bytes | str | None], zipped: bool = False, name: str = "set"
     ) -> Path:
         contents = dict.fromkeys(files) if isinstance(files, list) else files
-        data = {file: encode(at) if one is None else one for at, (file, one) in enumerate(contents.items())}
-        if zipped:
-            path = tmp_path / f"{name}.zip"
-            with zipfile.ZipFile(path, "w") as archive:
-                for file, content in data.items():
-                    archive.writestr(file, content)
-            return path
-        for file, content in data.items():
-            path = tmp_path / name / file
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return tmp_path / name
+        return write_tree(tmp_path / name, contents, zipped)
 
     return make
+
+
+def write_tree(place: Path, contents: dict[str, bytes | str | None], zipped: bool = False) -> Path:
+    data = {file: encode(at) if one is None else one for at, (file, one) in enumerate(contents.items())}
+    if zipped:
+        path = place.with_name(f"{place.name}.zip")
+        with zipfile.ZipFile(path, "w") as archive:
+            for file, content in data.items():
+                archive.writestr(file, content)
+        return path
+    for file, content in data.items():
+        path = place / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return place
 
 
 @pytest.fixture

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from derender.data import MASK_CLASSES, list_images, read_ground_truth, read_masks, split_indices
-from derender.data.synthetic.synthetic_set import camera_rotation_and_light
+from derender.data import MASK_CLASSES, list_images, read_masks, split_indices
 
 
 @pytest.mark.parametrize(
@@ -48,16 +47,3 @@ def test_celebamask_masks(shared_data):
     assert {"background", "skin", "hair"} == {classes[place] for place in np.argsort(shares)[-3:]}
     assert shares.min() > 0 or classes[int(shares.argmin())] in ("neck_l", "hat", "ear_r", "eye_g")
     assert (masks[:, 32, 32] != 0).mean() > 0.95
-
-
-def test_synface_ground_truth_explains_its_pictures(shared_data):
-    """Depth, normals, albedo, light and camera fit together: shading by them gives the stored image."""
-    truth = read_ground_truth(shared_data("data/synface64.zip"), limit=40)
-    assert 0.93 < truth.depth[truth.mask].min() < truth.depth[truth.mask].max() < 1.16
-    _, in_camera = camera_rotation_and_light(truth.camera, truth.light)
-    cosine = np.maximum(0, np.einsum("nhwi,ni->nhw", truth.normal, in_camera))
-    shading = truth.light[:, 0, None, None] + truth.light[:, 1, None, None] * cosine
-    picture = np.clip(truth.albedo * shading[:, None], 0, 1) * 255
-    error = np.abs(picture - truth.images).mean(axis=1)[truth.mask]
-    assert np.median(error) < 2
-    assert error.mean() < 3

@@ -236,16 +236,11 @@ def test_one_call_averages_caps_clusters_and_scores(tracks, tmp_path):
         cluster("faces-64", "who")
 
 
-def accuracy(table, **how) -> tuple[float, float, dict]:
-    """Of the first row and of chance, and all values."""
-    values = cluster(table, "identity", factors=None, resamples=10, cache="none", **how).values
-    rows = list(values["rows"].values())
-    return rows[0]["scores"]["accuracy"]["value"], rows[-1]["scores"]["accuracy"]["value"], values
-
-
 def test_pixels_on_lfw_reach_what_is_known(shared_data):
     """31 people, 20 images each: 0.24 by pixels, 0.13 by chance."""
     pixels = pixel_features(read_images(shared_data("data/lfw64.zip"), 64))
-    own, chance, values = accuracy(pixels, min_count=20, max_count=20)
+    how = {"factors": None, "min_count": 20, "max_count": 20, "resamples": 10, "cache": "none"}
+    values = cluster(pixels, "identity", **how).values
+    own, *_, chance = (row["scores"]["accuracy"]["value"] for row in values["rows"].values())
     assert (values["n_rows"], values["labels"]) == (620, {"identity": 31})
     assert (own, chance) == (pytest.approx(0.237, abs=0.01), pytest.approx(0.13, abs=0.01))

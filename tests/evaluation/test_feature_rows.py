@@ -26,6 +26,7 @@ def test_features_labels_and_controls_are_handed_on():
     ready = prepare(rows, ("who",))
     assert [len(arrays) for arrays in ready.features.values()] == [1, 2]
     assert ready.features["pixels"][0].shape == (6, 3) and ready.controls == ("pixels",)
+    assert Options(factors="geometry").chosen == ("geometry",)
     np.testing.assert_array_equal(ready.labels["who"], WHO)
     np.testing.assert_array_equal(ready.table.label("track"), TRACK)
 
@@ -39,10 +40,6 @@ def test_tracks_are_averaged_in_every_row_by_the_first_rows_labels():
     np.testing.assert_allclose(ready.features["other"][0], expected, rtol=1e-6)
     with pytest.raises(ValueError, match="label 'track' differs inside groups of who: average by it too"):
         prepare([row("ours", table())], ("track",), mean_by=("who",))
-
-
-def test_one_factor_may_be_a_name_alone():
-    assert Options(factors="geometry").chosen == ("geometry",)
 
 
 def test_classes_are_chosen_by_size():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from tests.training.conftest import assert_same_weights, weights
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, one_hot
 
 import derender
@@ -16,7 +16,6 @@ from derender.evaluation.linear_probes import head_loss
 from derender.evaluation.memory import Memory
 from derender.report.run import run_page
 from derender.training.batches import random_stream
-from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import PRESETS, FinetuneConfig, with_changes
 from derender.training.loop import train_task
 from derender.training.run_folder import RunFolder, read_metrics
@@ -49,10 +48,6 @@ def config(*more: str, labels=("shade",), **explicit) -> FinetuneConfig:
 def task(pictures, *more: str, start=None, **how) -> FinetuneTask:
     one = config(*more, **how)
     return FinetuneTask(one, pictures.images, target_of(pictures, one), start)
-
-
-def weights(run) -> dict[str, torch.Tensor]:
-    return load_file(run / "checkpoints" / "last" / WEIGHTS_FILE)
 
 
 def test_both_objectives_reach_the_encoders(pictures, tmp_path):
@@ -88,9 +83,7 @@ def test_a_resumed_run_ends_with_the_very_weights_and_the_model_loads(pictures, 
     train_task(whole, pictures, tmp_path / "whole")
     train_task(first, pictures, tmp_path / "parts")
     train_task(second, pictures, tmp_path / "parts", resume=True)
-    one, two = weights(tmp_path / "whole"), weights(tmp_path / "parts")
-    assert one.keys() == two.keys() and "head.linear.weight" in one
-    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert_same_weights(tmp_path / "whole", tmp_path / "parts")
     kinds = [row["kind"] for row in read_metrics(tmp_path / "whole")]
     assert kinds.count("validation") == 2
     judged = [row for row in read_metrics(tmp_path / "whole") if row["kind"] == "validation"]
@@ -101,7 +94,7 @@ def test_a_resumed_run_ends_with_the_very_weights_and_the_model_loads(pictures, 
     tuned = load_finetuned(tmp_path / "whole")
     assert torch.equal(tuned.model.embed(images)["geometry"], model.embed(images)["geometry"])
     assert tuned.predict(images).sum(dim=1) == pytest.approx(np.ones(4), abs=1e-5)
-    best = load_file(tmp_path / "whole" / "checkpoints" / "best" / WEIGHTS_FILE)
+    best = weights(tmp_path / "whole", "best")
     assert torch.equal(best["head.linear.weight"], tuned.head.linear.weight)
     assert "Preset small" in run_page(tmp_path / "whole").html()
     with pytest.raises(ValueError, match="was trained with another target"):

@@ -47,14 +47,11 @@ def test_verdict_leaves_out_rows_that_are_no_control():
     assert replace(scores, rows=rows).verdict(0).startswith("level with the strongest control")
 
 
-def test_best_ignores_what_is_no_number():
+def test_best_ignores_what_is_no_number_and_rows_must_fit_the_columns():
     scores = table(0.2, {"a": float("nan"), "b": None, "c": 0.3})
     assert scores.best(0) == 0.3
     assert table(0.2, {"a": None}).best(0) is None
     assert ScoreTable("", "", [Column("size")], [Row("a", [1]), Row("b", [2])]).best(0) is None
-
-
-def test_rows_must_fit_the_columns():
     with pytest.raises(ValueError, match="'ours' has 2 cells for 1 columns"):
         ScoreTable("", "", [Column("a")], [Row("ours", [1, 2])])
 

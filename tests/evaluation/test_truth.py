@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import binary_erosion
+from tests.scene.test_normals import plane
 
 import derender
 from derender.data import GroundTruth, read_ground_truth
@@ -23,12 +24,6 @@ from derender.scene import Scene
 from derender.scene.camera import pixel_rays, rotation_matrix
 
 FOV_DEG = 10.0
-
-
-def plane(normal: torch.Tensor, height: int = 14, width: int = 18) -> torch.Tensor:
-    """Depth of the plane through (0, 0, 1) with a given normal, seen at every pixel."""
-    rays = pixel_rays(height, width, FOV_DEG, torch.device("cpu"), torch.float64)
-    return (normal[2] / (rays @ normal))[None]
 
 
 def tilted(x_deg: float) -> torch.Tensor:
@@ -60,7 +55,7 @@ def test_the_truth_itself_scores_zero_at_any_scale():
 
 def test_mad_of_tilted_planes_is_the_angle_between_them():
     for a, b in ((0, 20), (-15, 40), (30, 30.001)):
-        depth = plane(tilted(a)), plane(tilted(b))
+        depth = plane(tilted(a), 14, 18), plane(tilted(b), 14, 18)
         scores = geometry_scores(depth[0], everywhere(depth[0]), depth[1], everywhere(depth[1]), FOV_DEG)
         assert scores.mad_deg == pytest.approx(abs(a - b), abs=1e-6)
 

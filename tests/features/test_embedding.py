@@ -1,10 +1,7 @@
 """Embedding to a file gives the table that embedding in memory gives, however often it was stopped; a damaged
 part is made again from there, and the user is told."""
 
-import io
 import json
-import tarfile
-import zipfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,8 +9,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from filelock import FileLock
-from PIL import Image
+from tests.data.conftest import encode, noise, write_tree
+from tests.data.stream.conftest import write_shard
 from tests.features.conftest import assert_same
+from tests.trust.test_kills import flip
 
 from derender.data import ImageSet, open_images, read_images
 from derender.features import FeatureTable, embed_image_set, embedding
@@ -26,10 +25,7 @@ COUNT = 110
 
 
 def png(seed: int) -> bytes:
-    buffer = io.BytesIO()
-    pixels = np.random.default_rng(seed).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(buffer, "PNG")
-    return buffer.getvalue()
+    return encode(noise(seed, 8, 8))
 
 
 def contents() -> dict[str, bytes]:
@@ -53,26 +49,15 @@ def small_parts(monkeypatch, tmp_path):
 def source(request, tmp_path) -> str:
     """The same images in three forms; the shards bring labels of several kinds along."""
     files = contents()
-    if request.param == "folder":
-        for name, data in files.items():
-            (tmp_path / "set" / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / "set" / name).write_bytes(data)
-        return str(tmp_path / "set")
-    if request.param == "zip":
-        with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
-            for name, data in files.items():
-                archive.writestr(name, data)
-        return str(tmp_path / "set.zip")
+    if request.param != "shards":
+        return str(write_tree(tmp_path / "set", files, request.param == "zip"))
     for number in range(2):
-        with tarfile.open(tmp_path / f"train-{number}.tar", "w") as tar:
-            for row, (name, data) in enumerate(files.items()):
-                if row * 2 // COUNT != number:
-                    continue
+        members = {}
+        for row, (name, data) in enumerate(files.items()):
+            if row * 2 // COUNT == number:
                 labels = {"n": row, "who": f"p{row}"} if row < 90 else {"n": row / 2, "late": row % 2 == 0}
-                for ending, content in ((".png", data), (".json", json.dumps(labels).encode())):
-                    info = tarfile.TarInfo(name.removesuffix(".png") + ending)
-                    info.size = len(content)
-                    tar.addfile(info, io.BytesIO(content))
+                members |= {name: data, f"{name.removesuffix('.png')}.json": json.dumps(labels)}
+        write_shard(tmp_path / f"train-{number}.tar", members)
     return str(tmp_path / "train-{0..1}.tar")
 
 
@@ -233,16 +218,10 @@ def stopped(model, pictures, tmp_path, monkeypatch):
     return sorted((tmp_path / "F.parquet.partial").glob("part-*"))
 
 
-def flipped(file) -> None:
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (flipped, "its checksum differs"),
+        (lambda file: flip(file, 0.5), "its checksum differs"),
         (lambda file: file.write_bytes(file.read_bytes()[:-1]), "its checksum differs"),
         (lambda file: file.write_bytes(b""), "its checksum differs"),
         (lambda file: file.unlink(), "part 2 is missing"),
@@ -273,9 +252,7 @@ def test_a_changed_byte_in_a_finished_table_is_an_error_and_not_another_number(m
     file = tmp_path / "F.parquet"
     embed_to_file(pictures, model, file)
     wanted = FeatureTable.read(file)
-    content = bytearray(file.read_bytes())
-    content[int(at * len(content))] ^= 16
-    file.write_bytes(content)
+    flip(file, at)
     try:
         assert_same(FeatureTable.read(file), wanted)
     except ValueError as problem:

@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from derender.model import Derenderer
 from derender.networks import FACTORS, NetworkSettings
-from derender.networks.decoders import ConfidenceNet, NarrowConv2d, UpsampledConv2d
+from derender.networks.decoders import NarrowConv2d, UpsampledConv2d
 from derender.networks.encoders import IMAGE_SIZES, NormReLU, UNetEncoder
 
 PAPER_PARAMETERS = {"geometry": 12_979_648, "albedo": 12_982_848, "confidence": 7_678_208}
@@ -58,7 +58,8 @@ def test_every_picture_size_gives_maps_and_codes_of_the_right_shape(size, encode
     scene = model.decode(codes)
     assert scene.depth.shape == (2, size, size)
     assert scene.albedo.shape == (2, 3, size, size)
-    confidence = model.confidence(images)
+    confidence = model.confidence(100 * images)
+    assert all(bool((value > 0).all()) for value in vars(confidence).values())
     assert confidence.photometric.shape == confidence.photometric_flip.shape == (2, 1, size, size)
     assert confidence.perceptual.shape == confidence.perceptual_flip.shape == (2, 1, size // 4, size // 4)
 
@@ -68,11 +69,6 @@ def test_unet_encoder_follows_the_papers_widths_and_offers_skips():
     skips = encoder.skips(torch.rand(1, 3, 64, 64))
     sizes = [(skip.shape[1], skip.shape[-1]) for skip in skips]
     assert sizes == [(16, 64), (32, 32), (64, 16), (128, 8), (256, 4)]
-
-
-def test_confidence_is_positive():
-    confidence = ConfidenceNet(NetworkSettings(width=8))(torch.rand(3, 3, 64, 64) * 100)
-    assert all(bool((value > 0).all()) for value in vars(confidence).values())
 
 
 @pytest.mark.parametrize("size", [48, 0, 512])

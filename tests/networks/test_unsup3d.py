@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.trust.test_no_code import Bomb
 from torch import Tensor, nn
 
 from derender.cli import main
@@ -136,16 +137,6 @@ class Meter:
 
     def __init__(self):
         self.values = [1.0, 2.0]
-
-
-class Bomb:
-    """Unpickling it makes a file."""
-
-    def __init__(self, file: Path):
-        self.file = file
-
-    def __reduce__(self):
-        return Path.touch, (self.file,)
 
 
 @pytest.mark.parametrize("zipped", [True, False])

@@ -1,17 +1,9 @@
 """The shipped models give the outputs that were recorded: codes, features, scenes, renderings, fits."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-
-_file = Path(__file__).with_name("record_outputs.py")
-_spec = importlib.util.spec_from_file_location("record_outputs", _file)
-assert _spec is not None and _spec.loader is not None
-record = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(record)
+from tests.pretrained import record_outputs as record
 
 LARGEST_DIFFERENCE = 1e-5  # of the largest value of each output
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from derender import Derenderer
 from derender.data import ImageSet
 from derender.report.evidence import Subject, gather, suitable_label
 from derender.report.run import loss_charts, run_page
@@ -60,11 +59,6 @@ def test_curves_need_two_points_and_leave_out_what_is_no_number():
 
 
 @pytest.fixture(scope="module")
-def model() -> Derenderer:
-    return Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4).eval()
-
-
-@pytest.fixture(scope="module")
 def pictures() -> ImageSet:
     """Coloured noise, brighter where the label says so; one name is markup."""
     generator = np.random.default_rng(0)
@@ -78,10 +72,12 @@ def pictures() -> ImageSet:
     )
 
 
-def test_everything_that_can_be_told_is_told_and_escaped(model, pictures, tmp_path):
+def test_everything_that_can_be_told_is_told_and_escaped(smallest, pictures, tmp_path):
     pytest.importorskip("captum")
     done = []
-    result = gather(Subject(model, pictures, pictures, "All of them"), lambda *step: done.append(step))
+    result = gather(
+        Subject(smallest.eval(), pictures, pictures, "All of them"), lambda *step: done.append(step)
+    )
     assert list(result.sections) == ["data", "decomposed", "films", "scores", "card", "explained"]
     assert result.failed == [] and done == [(step, 6) for step in range(7)]
     html = run_page(start_run(tmp_path / "run", resolve("small"), {}, "cpu").path, result).html()

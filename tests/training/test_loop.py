@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tests.training.conftest import noise_set
+from tests.training.conftest import assert_same_weights, noise_set, weights
 
 import derender
 from derender.cli import main
@@ -36,16 +36,6 @@ TINY += ["warmup_images=0", "final_rate=1", "whitening.pictures=0", "fitting.exa
 @pytest.fixture(scope="module")
 def pictures() -> ImageSet:
     return noise_set(60, cells=4)
-
-
-def weights(run) -> dict[str, torch.Tensor]:
-    return load_file(run / "checkpoints" / "last" / WEIGHTS_FILE)
-
-
-def assert_same_weights(one, two):
-    first, second = weights(one), weights(two)
-    assert first.keys() == second.keys()
-    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
@@ -129,11 +119,12 @@ def test_self_trained_perceptual_features_are_kept_for_the_resumed_run(pictures,
     assert_same_weights(tmp_path / "whole", tmp_path / "parts")
 
 
-def test_patience_ends_a_run_that_no_longer_improves(pictures, tmp_path):
+def test_patience_ends_a_run_that_no_longer_improves_and_minutes_end_any(pictures, tmp_path):
     config = resolve("small", [*TINY, "images=3200", "patience=2", "learning_rate=1e-12", "watch=false"])
     result = train(config, pictures, tmp_path / "run")
-    assert result.stopped == "patience"
-    assert result.images <= 32 * 8
+    assert result.stopped == "patience" and result.images <= 32 * 8
+    result = train(resolve("small", [*TINY, "images=1000000", "minutes=0.01"]), pictures, tmp_path / "short")
+    assert result.stopped == "minutes" and (tmp_path / "short" / "checkpoints" / "last").is_dir()
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +144,8 @@ def model_of(run) -> dict[str, torch.Tensor]:
 
 
 def assert_model_is_of(run, checkpoint: str):
-    kept_weights, wanted = model_of(run), load_file(run / "checkpoints" / checkpoint / WEIGHTS_FILE)
-    assert all(torch.equal(wanted[name], value) for name, value in kept_weights.items())
+    wanted = weights(run, checkpoint)
+    assert all(torch.equal(wanted[name], value) for name, value in model_of(run).items())
 
 
 def test_the_model_is_of_the_best_validation_and_the_result_says_of_which(worsening):
@@ -216,12 +207,6 @@ def test_a_run_without_held_out_pictures_keeps_its_last_weights(pictures, tmp_pa
     assert_model_is_of(tmp_path / "run", "last")
 
 
-def test_minutes_end_a_run(pictures, tmp_path):
-    result = train(resolve("small", [*TINY, "images=1000000", "minutes=0.01"]), pictures, tmp_path / "run")
-    assert result.stopped == "minutes"
-    assert (tmp_path / "run" / "checkpoints" / "last").is_dir()
-
-
 def test_resuming_nothing_or_with_other_settings_is_refused(pictures, tmp_path):
     config = resolve("small", [*TINY, "images=32"])
     with pytest.raises(FileNotFoundError, match="no run to resume"):
@@ -231,15 +216,11 @@ def test_resuming_nothing_or_with_other_settings_is_refused(pictures, tmp_path):
         train(resolve("small", [*TINY, "images=64", "seed=4"]), pictures, tmp_path / "run", resume=True)
 
 
-def test_one_picture_or_too_few_for_a_batch_is_refused_before_a_folder_is_made(pictures, tmp_path):
+def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(pictures, tmp_path):
     with pytest.raises(ValueError, match="only one image was found"):
         train(resolve("small", TINY), pictures.select([0]), tmp_path / "run")
     with pytest.raises(ValueError, match="64 is more than the 48 training images: set batch_size=24"):
         train(resolve("small", [*TINY, "batch_size=64"]), pictures, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-def test_missing_perceptual_weights_are_refused_before_a_folder_is_made(pictures, tmp_path):
     config = resolve("small", [*TINY, "perceptual=vgg16", f"vgg16_path={tmp_path / 'none.npz'}"])
     with pytest.raises((ValueError, OSError), match=r"none\.npz"):
         train(config, pictures, tmp_path / "run")

@@ -6,8 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
-from tests.training.conftest import noise_set
+from tests.training.conftest import assert_same_weights, noise_set
 from torch.nn.functional import avg_pool2d
 
 import derender
@@ -17,7 +16,6 @@ from derender.objectives.reconstruction import depth_smoothness
 from derender.postprocess import Features
 from derender.scene.enlarge import doubled
 from derender.training import resolve, train
-from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import with_changes
 from derender.training.derender_task import DerenderTask
 from derender.training.features import fit_whitening
@@ -77,9 +75,7 @@ def test_a_resumed_run_needs_the_start_no_more_and_ends_with_the_same_weights(gi
     shutil.rmtree(given)
     resumed = train(whole_config, pictures, tmp_path / "half", resume=True)
     assert resumed.images == whole.images == 32
-    one, two = (load_file(run.folder / "checkpoints/last" / WEIGHTS_FILE) for run in (whole, resumed))
-    assert one.keys() == two.keys()
-    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert_same_weights(whole.folder, resumed.folder)
 
 
 TINY = ["image_size=32", "width=8", "light_width=4", "code_size=16", "border_share=0.0625"]

@@ -1,22 +1,11 @@
 """A function in a process of its own, and waiting for its end: shared by the scripts of this folder."""
 
-import importlib.util
 import os
 import sys
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
-
-
-def script(name: str) -> ModuleType:
-    """A script of this folder as a module."""
-    spec = importlib.util.spec_from_file_location(Path(name).stem, Path(__file__).parent / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = sys.modules[Path(name).stem] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def start(work: Callable[[], int], log: Path, *, failed: int = 1) -> int:

@@ -1,6 +1,5 @@
 """Images that are broken, odd or meant to do harm, made on the spot, and an archive of the kind."""
 
-import io
 import os
 import struct
 import zipfile
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageCms
+from tests.data.conftest import encode as encoded
 
 NAMES = ("ÄÖ ß 日本.png", "two\nlines.png", "quote\"'.png", "tab\there.png", "-rf.png", "a" * 240 + ".png")
 NAMES += ("<script>.png",)
@@ -36,12 +36,6 @@ def smooth(seed: int, size: tuple[int, int] = (48, 40)) -> Image.Image:
     """An image that differs with the seed."""
     small = np.random.default_rng(seed).integers(0, 256, (5, 5, 3), dtype=np.uint8)
     return Image.fromarray(small).resize(size)
-
-
-def encoded(picture: Image.Image, form: str = "PNG", **options: object) -> bytes:
-    stream = io.BytesIO()
-    picture.save(stream, format=form, **options)
-    return stream.getvalue()
 
 
 def png_chunk(kind: bytes, content: bytes) -> bytes:

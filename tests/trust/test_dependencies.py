@@ -6,9 +6,8 @@ import tomllib
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
-from tests.trust.apart import script
+from tests.trust import advisories, licences
 
-advisories = script("advisories")
 ROOT = advisories.ROOT
 BOUNDS = advisories.lower_bounds()
 _, FOUND = advisories.looked_up()
@@ -49,7 +48,7 @@ def test_the_page_has_every_package():
 
 def test_every_package_that_is_asked_for_has_a_licence():
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
-    listed = dict(re.findall(r"^\| \[?([\w.-]+).* \| (.+) \|$", script("licences").page(), re.MULTILINE))
+    listed = dict(re.findall(r"^\| \[?([\w.-]+).* \| (.+) \|$", licences.page(), re.MULTILINE))
     names = {*BOUNDS, *(canonicalize_name(Requirement(text).name) for text in groups["dev"])}
     assert names - listed.keys() <= {"standard-imghdr"}  # needed from Python 3.13 on only
     assert all(licence.strip() for licence in listed.values())

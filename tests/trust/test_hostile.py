@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from tests.trust.hostile_files import UNSAFE, encoded, smooth, write_hostile, write_hostile_zip
 
-import derender
 from derender.cli import main
 from derender.data import Unreadable, read_image, read_images
 from derender.data.source import FolderSource
@@ -25,12 +24,6 @@ from derender.data.source import FolderSource
 def hostile(tmp_path_factory):
     """The corpus, every format cut off at each eighth."""
     return write_hostile(tmp_path_factory.mktemp("made") / "hostile", steps=8)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> str:
-    net = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    return str(net.save(tmp_path_factory.mktemp("model") / "tiny"))
 
 
 @pytest.fixture
@@ -69,13 +62,13 @@ def test_exif_turns_an_image_and_an_animation_gives_its_first_frame(hostile):
     assert np.array_equal(first, read_image(encoded(smooth(16)), 16))
 
 
-def test_commands_count_broken_files_and_name_them(hostile, model, tmp_path, capsys):
+def test_commands_count_broken_files_and_name_them(hostile, tiny, tmp_path, capsys):
     told = tmp_path / "told.json"
     every = [str(hostile.folder), "--dataset", "folder", "--json", str(told)]
     assert main(["doctor", *every]) == 0
     unreadable = json.loads(told.read_text())["unreadable"]
     assert sorted(row["file"] for row in unreadable) == sorted(hostile.unreadable)
-    out = ["--model", model, "--device", "cpu", "--out"]
+    out = ["--model", str(tiny), "--device", "cpu", "--out"]
     assert "Traceback" not in capsys.readouterr().err
     assert main(["embed", *every, *out, str(tmp_path / "F.parquet")]) == 0
     assert json.loads(told.read_text())["skipped"] == len(hostile.unreadable)
@@ -136,10 +129,10 @@ def test_files_and_folders_without_permission_are_skipped_and_named(plain, monke
     }
 
 
-def test_names_cannot_steer_the_terminal(plain, model, capsys):
+def test_names_cannot_steer_the_terminal(plain, tiny, capsys):
     evil = plain / "\x1b]0;owned\x07\x1b[2J.png"
     evil.write_bytes(b"broken")
-    given = ["--model", model, "--device", "cpu", "--out"]
+    given = ["--model", str(tiny), "--device", "cpu", "--out"]
     assert main(["embed", "--data", str(plain), *given, str(plain / "F.parquet")]) == 0
     assert main(["decompose", str(evil), *given, str(plain / "out")]) == 2
     message = capsys.readouterr()

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from PIL import Image
-from tests.trust.apart import script
+from tests.trust.releases import make
 
 import derender
 from derender.baselines import load_baseline
@@ -28,7 +28,6 @@ RELEASES = Path(__file__).with_name("releases")
 VERSIONS = sorted(folder.name for folder in RELEASES.iterdir() if (folder / "expected.json").is_file())
 LARGEST_BYTES = 250_000
 NEWER = r"format 2.*(reads up to 1: update|newer than this version of) derender"
-make = script("releases/make")
 
 
 @pytest.fixture(params=VERSIONS)

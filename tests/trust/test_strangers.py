@@ -88,23 +88,18 @@ def sparse(file: Path, gigabytes: int = 8) -> Path:
     return file
 
 
-@pytest.fixture(scope="module")
-def model() -> derender.Derenderer:
-    return derender.Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-
-
 @pytest.fixture
-def run(tmp_path, model) -> Path:
+def run(tmp_path, smallest) -> Path:
     """A run folder with every file that readers look at."""
     folder = tmp_path / "run"
-    model.save(folder / "model")
+    smallest.save(folder / "model")
     (folder / "samples").mkdir()
     config = resolve("small", ["image_size=32", "width=4", "light_width=4"])
     (folder / "config.yaml").write_text(to_yaml(config))
     (folder / "environment.json").write_text('{"python": "3.12", "data": {"pictures": 8}}')
     (folder / "metrics.jsonl").write_text('{"kind": "train", "images": 8, "seconds": 1.5, "loss": NaN}\n')
-    optimiser = torch.optim.Adam(model.parameters())
-    save_checkpoint(folder / "checkpoints" / "last", model, optimiser, TrainState(images=8))
+    optimiser = torch.optim.Adam(smallest.parameters())
+    save_checkpoint(folder / "checkpoints" / "last", smallest, optimiser, TrainState(images=8))
     run_page(folder)
     return folder
 
@@ -157,8 +152,8 @@ JSON_FILES = {
 
 
 @pytest.mark.parametrize("name", JSON_FILES)
-def test_json_of_a_stranger_is_one_line_of_error_or_read_and_takes_no_memory(name, run, model):
-    file, read = run / name, partial(JSON_FILES[name], run, model)
+def test_json_of_a_stranger_is_one_line_of_error_or_read_and_takes_no_memory(name, run, smallest):
+    file, read = run / name, partial(JSON_FILES[name], run, smallest)
     (run / "model" / "probe.safetensors").write_bytes(b"")
     refused = 0
     for attack in JSON_ATTACKS:
@@ -210,7 +205,7 @@ def test_metrics_name_the_line_and_forgive_one_cut_off_at_the_end(run):
     assert main(["report", str(run), *images, "--force"]) == 2
 
 
-def test_cards_and_errors_beside_a_model_are_bounded(run, model, tmp_path):
+def test_cards_and_errors_beside_a_model_are_bounded(run, tmp_path):
     assert _errors_in_words(DEEP) == _errors_in_words('{"pictures": Infinity, "quantiles": [1]}') == ""
     loaded = derender.load(run)
     sparse(run / "model" / "README.md")
@@ -218,7 +213,7 @@ def test_cards_and_errors_beside_a_model_are_bounded(run, model, tmp_path):
         Shareable.save_pretrained(loaded, tmp_path / "copy")
 
 
-def test_weights_larger_than_their_network_are_refused_unread(run, model):
+def test_weights_larger_than_their_network_are_refused_unread(run, smallest):
     weights = run / "model" / "model.safetensors"
     head = json.dumps({"a": {"dtype": "F32", "shape": [10 << 30], "data_offsets": [0, 40 << 30]}}).encode()
     sparse(weights, 40)
@@ -235,7 +230,7 @@ def test_weights_larger_than_their_network_are_refused_unread(run, model):
         sparse(last / name, 40)
         (last / "checksums.json").write_text(json.dumps({"crc32": {"state.json": [1, 1]}}))
         with cheaply(), pytest.raises(ValueError, match="is damaged"):
-            load_checkpoint(last, model, torch.optim.Adam(model.parameters()))
+            load_checkpoint(last, smallest, torch.optim.Adam(smallest.parameters()))
 
 
 def test_only_regular_files_are_read(tmp_path):

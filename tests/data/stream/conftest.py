@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.data.conftest import encode
 
 
 @pytest.fixture(autouse=True)
@@ -15,18 +16,18 @@ def cache(tmp_path: Path, monkeypatch) -> Path:
     return tmp_path / "cache"
 
 
-@pytest.fixture
-def shard(tmp_path: Path, encoded) -> Callable[..., Path]:
-    def write(name: str, members: dict[str, bytes | str | None], mode: str = "w", first: int = 0) -> Path:
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tarfile.open(path, mode) as tar:
-            for seed, (member, content) in enumerate(members.items(), first):
-                data = encoded(seed) if content is None else content
-                data = data.encode() if isinstance(data, str) else data
-                info = tarfile.TarInfo(member)
-                info.size = len(data)
-                tar.addfile(info, io.BytesIO(data))
-        return path
+def write_shard(path: Path, members: dict[str, bytes | str | None], mode: str = "w", first: int = 0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(path, mode) as tar:
+        for seed, (member, content) in enumerate(members.items(), first):
+            data = encode(seed) if content is None else content
+            data = data.encode() if isinstance(data, str) else data
+            info = tarfile.TarInfo(member)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+    return path
 
-    return write
+
+@pytest.fixture
+def shard(tmp_path: Path) -> Callable[..., Path]:
+    return lambda name, *members, **how: write_shard(tmp_path / name, *members, **how)

@@ -1,6 +1,6 @@
 """A user's own morphable model: read, checked, and pictured like the built-in faces."""
 
-import importlib.util
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -100,14 +100,10 @@ def test_bad_files_are_named(tmp_path, changes, message):
         MorphableFaces.read(saved(tmp_path / "m.npz", **changes))
 
 
-@pytest.fixture(scope="module")
-def converter():
-    path = ROOT / "examples/convert_ict_facekit.py"
-    spec = importlib.util.spec_from_file_location("convert_ict_facekit", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def converter(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    return importlib.import_module("convert_ict_facekit")
 
 
 @pytest.fixture

@@ -14,6 +14,8 @@ from PIL import Image
 pytest.importorskip("starlette", reason="the viewer's packages are not installed: derender[view]")
 pytest.importorskip("uvicorn", reason="the viewer's packages are not installed: derender[view]")
 
+from tests.conftest import made_smallest
+from tests.data.conftest import encode, noise
 from tests.report.viewer.serving import serving
 
 from derender import Derenderer
@@ -26,10 +28,7 @@ SIZE = 32
 
 def _encoded(seed: int) -> bytes:
     """An image of coloured noise, as a file's bytes."""
-    coarse = np.random.default_rng(seed).integers(0, 256, (6, 6, 3), dtype=np.uint8)
-    stream = io.BytesIO()
-    Image.fromarray(coarse).resize((48, 40)).save(stream, format="PNG")
-    return stream.getvalue()
+    return encode(Image.fromarray(noise(seed, 6, 6)).resize((48, 40)))
 
 
 @dataclass
@@ -98,8 +97,7 @@ class Client:
 @pytest.fixture(scope="session")
 def model() -> Derenderer:
     """An untrained model of the smallest kind."""
-    net = Derenderer.from_preset("small", seed=0, image_size=SIZE, width=4, light_width=4)
-    return net.eval().requires_grad_(False)
+    return made_smallest().eval().requires_grad_(False)
 
 
 @pytest.fixture(scope="session")

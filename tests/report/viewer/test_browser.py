@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.data.conftest import encode
 from tests.report.viewer.serving import serving
 
 from derender import load
@@ -94,9 +95,7 @@ def at_rest(page) -> None:
 
 
 def png(picture: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(picture.transpose(1, 2, 0)).save(stream, format="PNG")
-    return stream.getvalue()
+    return encode(picture.transpose(1, 2, 0))
 
 
 def dropped(page, name: str, content: bytes) -> None:

@@ -1,11 +1,11 @@
 """What is no image, lies, or would fill the memory is refused with a sentence; what is one is read."""
 
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from tests.data.conftest import encode
 from tests.trust.hostile_files import png_that_says
 
 from derender.report.viewer.app import BODY_LIMIT_BYTES
@@ -13,9 +13,7 @@ from derender.report.viewer.questions import PIXEL_LIMIT, Refused, pixels_of
 
 
 def saved(form: str, mode: str = "RGB", size: tuple[int, int] = (20, 14)) -> bytes:
-    stream = io.BytesIO()
-    Image.effect_noise(size, 80).convert(mode).save(stream, format=form)
-    return stream.getvalue()
+    return encode(Image.effect_noise(size, 80).convert(mode), form)
 
 
 @pytest.mark.parametrize("form", ["PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "PPM"])
@@ -54,15 +52,11 @@ def test_bounds_on_pixels_and_bytes(client):
 
 
 def test_transparent_and_turned_pictures_are_laid_right():
-    clear = io.BytesIO()
-    Image.new("RGBA", (9, 9), (0, 0, 0, 0)).save(clear, format="PNG")
-    assert (pixels_of(clear.getvalue(), 4) == 255).all()
-    turned = io.BytesIO()
+    assert (pixels_of(encode(Image.new("RGBA", (9, 9), (0, 0, 0, 0))), 4) == 255).all()
     half = Image.fromarray(np.repeat(np.array([[0], [255]], np.uint8), 8, axis=0).repeat(16, axis=1))
     exif = Image.Exif()
     exif[0x0112] = 3  # upside down
-    half.convert("RGB").save(turned, format="JPEG", exif=exif, quality=95)
-    upright = pixels_of(turned.getvalue(), 16)
+    upright = pixels_of(encode(half.convert("RGB"), "JPEG", exif=exif, quality=95), 16)
     assert upright[:, :4].mean() > 200 > 50 > upright[:, -4:].mean()
 
 
