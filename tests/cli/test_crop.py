@@ -48,7 +48,7 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, numbers):
 
 def test_detail_films_and_meshes_are_of_the_same_part(photos, tmp_path, numbers):
     words = ("-m", KNOWN, photos / "wide.png", "--frame", "auto")
-    words += ("--texture", "original", "-o")
+    words += ("--fit-steps", 0, "--texture", "original", "-o")
     few = ["--stills", "2", "--film", "none", "--like", photos / "wide.png"]
     relit, _ = numbers("relight", *words, tmp_path / "relit", *few)
     meshes, _ = numbers("mesh", *words, tmp_path / "meshes")

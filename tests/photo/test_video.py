@@ -67,7 +67,7 @@ def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd):
     (tmp_path / "none.mp4").write_bytes(b"no film")
     (tmp_path / "none.png").write_bytes(b"no image")
     named = [str(film), *(str(tmp_path / name) for name in ("none.mp4", "none.png"))]
-    words = [*words[:3], *named, "-o", str(tmp_path / "two")]
+    words = [*words[:3], *named, "-o", str(tmp_path / "two"), "--fit-steps", "0"]
     assert main(words) == 2  # the others are edited
     assert capfd.readouterr().err.count("\n") == 2, "a line each, and none of OpenCV's"
     assert [folder.name for folder in (tmp_path / "two").iterdir()] == ["film"]

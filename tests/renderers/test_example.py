@@ -17,7 +17,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 @pytest.fixture
 def made(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    arguments = ["--out", str(tmp_path), "--count", "40", "--images", "32", "--size", "32"]
+    arguments = ["--out", str(tmp_path), "--count", "24", "--images", "16", "--size", "32"]
     monkeypatch.setattr(sys, "argv", ["05_new_factor.py", *arguments])
     importlib.import_module("05_new_factor").main()
     return tmp_path, capsys.readouterr().out
@@ -25,7 +25,7 @@ def made(tmp_path, monkeypatch, capsys):
 
 def test_the_example_goes_through_every_command(made):
     folder, printed = made
-    assert "'white': (40, 256)" in printed and "Swap test" in printed
+    assert "'white': (24, 256)" in printed and "Swap test" in printed
     model = derender.load(folder / "run")
     assert model.renderer.name == "05_new_factor:BALANCE" and model.factors[-1].name == "white"
     image, other = sorted((folder / "data" / "images").iterdir())[:2]

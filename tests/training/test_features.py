@@ -190,8 +190,8 @@ def test_the_canonical_view_of_turned_heads_differs_less_than_they_do(plain, ima
 
 
 def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tmp_path):
-    settings = WhiteningSettings(pictures=24, views=2, directions=8, photographs=True, canonical=True)
-    model, pixels = whitened(plain, images[:24], settings), images[:6].float() / 255
+    settings = WhiteningSettings(pictures=12, views=2, directions=8, photographs=True, canonical=True)
+    model, pixels = whitened(plain, images[:12], settings), images[:6].float() / 255
     turned = plain.factor_activations("geometry", plain.canonical_view(pixels))
     assert model.whitening.canonical == {"geometry"}
     activations = model.activations(pixels)
@@ -208,15 +208,15 @@ def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tm
     maps = [saliency(method, model, pixels, "geometry") for method in ("grad-cam", "pixels")]
     assert [one.shape for one in maps] == [(6, 4, 4), (6, 64, 64)] and all(one.amax() > 0 for one in maps)
     codes = settings.model_copy(update={"spatial": False})
-    assert whitened(plain, images[:24], codes).whitening.canonical == set()
+    assert whitened(plain, images[:12], codes).whitening.canonical == set()
 
 
 def test_features_of_framed_images_are_kept_with_the_model(plain, images, tmp_path, monkeypatch):
     monkeypatch.setattr("derender.training.framing.BATCH", 16)
     monkeypatch.setattr("derender.postprocess.framing.DOUBT", 0.0)  # every image is moved
-    settings = WhiteningSettings(pictures=24, views=2, directions=8, photographs=True, canonical=True)
+    settings = WhiteningSettings(pictures=12, views=2, directions=8, photographs=True, canonical=True)
     settings = settings.model_copy(update={"framing": 32})
-    model, pixels = whitened(plain, images[:24], settings), images[:4].float() / 255
+    model, pixels = whitened(plain, images[:12], settings), images[:4].float() / 255
     framed = model.whitening.framing(pixels)
     assert not torch.allclose(framed, pixels, atol=0.05) and model.whitening.moved == {"geometry", "albedo"}
     activations = model.activations(pixels)
@@ -227,7 +227,7 @@ def test_features_of_framed_images_are_kept_with_the_model(plain, images, tmp_pa
     mirrored = plain.factor_activations("albedo", framed.flip(-1))
     torch.testing.assert_close(taken, (own + mirrored) / 2, rtol=1e-3, atol=1e-4)
     again = derender.load(model.save(tmp_path / "model"))
-    kept = whitened(again, images[:24], settings)
+    kept = whitened(again, images[:12], settings)
     for name, value in model.embed(pixels).items():
         torch.testing.assert_close(again.embed(pixels)[name], value)
         torch.testing.assert_close(kept.embed(pixels)[name], value)
