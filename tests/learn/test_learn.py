@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.training.conftest import noise_set
 
 import derender
 from derender.data import ImageSet
@@ -18,9 +19,7 @@ TINY = {
 
 @pytest.fixture(scope="module")
 def images() -> ImageSet:
-    pixels = np.random.default_rng(0).integers(0, 256, (40, 3, 32, 32), dtype=np.uint8)
-    labels = {"bright": np.arange(40) % 2}
-    return ImageSet(pixels, tuple(f"{row:02d}.png" for row in range(40)), labels, source="made by the test")
+    return replace(noise_set(40), labels={"bright": np.arange(40) % 2})
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,11 @@ from collections.abc import Callable
 from functools import partial
 from math import inf, isfinite, isnan, nan
 
-import numpy as np
 import pytest
 import torch
+from tests.training.conftest import noise_set
 from torch import Tensor, nn
 
-from derender.data import ImageSet
 from derender.features.extract import embed_image_set
 from derender.model import Derenderer
 from derender.networks.decoders import Confidence
@@ -166,11 +165,6 @@ def test_a_sum_that_overflows_is_no_broken_gradient(model):
     assert broken_gradient(model) is None
 
 
-def picture_set(count: int = 20) -> ImageSet:
-    pixels = np.random.default_rng(0).integers(0, 256, (count, 3, SIZE, SIZE), dtype=np.uint8)
-    return ImageSet(images=pixels, files=tuple(f"{number:03d}.png" for number in range(count)))
-
-
 def run_of(spoiler: Callable[[Derenderer], None], folder, monkeypatch, *settings: str) -> tuple[Finding, ...]:
     """Train with a model that is spoiled as it is built; gives what ended the run. No file may hold a NaN."""
     build = DerenderTask.build
@@ -182,7 +176,7 @@ def run_of(spoiler: Callable[[Derenderer], None], folder, monkeypatch, *settings
 
     monkeypatch.setattr(DerenderTask, "build", built)
     tiny = (f"image_size={SIZE}", "width=4", "light_width=4", "batch_size=4", "images=12", "perceptual=none")
-    result = train(resolve("small", (*tiny, "whitening.pictures=0", *settings)), picture_set(), folder)
+    result = train(resolve("small", (*tiny, "whitening.pictures=0", *settings)), noise_set(20), folder)
     assert result.stopped == "collapse"
     assert not list(folder.rglob("model.safetensors"))
     return result.findings
@@ -219,7 +213,7 @@ def test_a_broken_step_leaves_the_weights_of_the_step_before(model, monkeypatch,
     monkeypatch.setattr(DerenderTask, "build", built)
     tiny = ("batch_size=4", "images=36", "perceptual=none", "whitening.pictures=0", "fitting.examples=0")
     config = resolve("small", tiny).model_copy(update={"model": model.settings})
-    result = train(config, picture_set(), tmp_path / "run", progress=keep)
+    result = train(config, noise_set(20), tmp_path / "run", progress=keep)
     assert (result.stopped, result.images, len(after)) == ("collapse", 12, 9)
     assert "the gradient of nets.light.encoder" in result.findings[-1].text
     same = [all(map(torch.equal, after[1], weights)) for weights in after]
@@ -272,13 +266,13 @@ def test_embedding(model, stage, bad):
         maps = {"albedo": Projection(torch.zeros(width), torch.full((width, 16), bad), torch.ones(16))}
         model = model.with_features(Features(Whitening(maps)))
     with pytest.raises(ValueError, match=r"factor 'albedo' is not finite in \d+ of 20 rows, first in 000"):
-        embed_image_set(model, picture_set(), batch_size=20)
+        embed_image_set(model, noise_set(20), batch_size=20)
 
 
 def test_held_out_errors(model):
     spoil(model.nets["albedo"].decoder, nan)
     with pytest.raises(NotFinite, match="the reconstructions of 20 of 20 images are NaN"):
-        errors_of(model, picture_set().images, batch_size=1)
+        errors_of(model, noise_set(20).images, batch_size=1)
 
 
 def test_baselines():

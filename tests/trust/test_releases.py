@@ -130,8 +130,8 @@ def test_what_comes_from_the_future_is_refused(copy, read, place, change):
         read(copy / place)
 
 
-def test_a_run_from_the_future(copy):
-    """Its format speaks before a setting that nobody knows yet does."""
+def test_a_run_from_the_future_and_one_from_before_formats_were_counted(copy):
+    """The format speaks before a setting that nobody knows yet does."""
     file = copy / "run" / "config.yaml"
     text = file.read_text()
     assert text.startswith("format: 1\n")
@@ -142,11 +142,7 @@ def test_a_run_from_the_future(copy):
         file.write_text(text.replace("format: 1", f"format: {odd}"))
         with pytest.raises(ValueError, match="was written in format"):
             read_config_tree(copy / "run")
-
-
-def test_a_run_from_before_formats_were_counted(copy):
-    file = copy / "run" / "config.yaml"
-    file.write_text(file.read_text().removeprefix("format: 1\n"))
+    file.write_text(text.removeprefix("format: 1\n"))
     assert read_config(copy / "run").optimiser.learning_rate == 2e-4
 
 
