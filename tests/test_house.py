@@ -31,7 +31,7 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (920, 5),
 }
-TOTAL = (39_313, 241)  # on the way to (37_000, 270)
+TOTAL = (39_315, 241)  # on the way to (37_000, 270)
 TEST_LINES = 25_986
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
-from derender.photo.frame import sampled
+from derender.photo.frame import look_up, sampled
 from derender.render import Rendering, warp
 from derender.renderers import Renderer
 from derender.scene import Scene
@@ -113,7 +113,7 @@ class PhotoDetail:
         sizes = (own.shape[1], own.shape[1], 3, 1, 1, veil.shape[1])
         own, mirrored, colours, inside, shading, veil = view.image.split(sizes, dim=1)
         covered = view.mask[:, None]
-        place = own[:, :2] - _look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
+        place = own[:, :2] - look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
         shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
         moved = (inside * shift)[..., ::4, ::4].norm(dim=1).amax(dim=(1, 2))[:, None, None, None] / self.grid
         seen = 1 - inside * (1 - torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED)))
@@ -256,7 +256,7 @@ class PhotoDetail:
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""
         photo = self.on_grid(self.photo[None], self.grid) + self.on_grid(self._lost, self.grid)
-        photo = _look_up(photo, self._place - self.reach)
+        photo = look_up(photo, self._place - self.reach)
         bare = (_cleared(photo, self._veil) / self._shading.clamp(min=LIT[0])).clamp(0, 1)
         inner = self._seen * self._around(-COLOUR_MARGIN - FEATHER_SHARE, -COLOUR_MARGIN)
         weight, mirror_weight = inner, (1 - inner) * inner.flip(-1)
@@ -268,7 +268,7 @@ class PhotoDetail:
     def _visible(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 g g"]:
         """How well the photograph shows each canonical point, 0..1."""
         view = self._warped(own.albedo[:, :1], own)
-        front = _look_up(view.depth[:, None], self._place, "nearest")
+        front = look_up(view.depth[:, None], self._place, "nearest")
         start = self.reach - self.rim
         inside = ((self._place >= start) & (self._place < self.wide - start)).all(dim=1, keepdim=True)
         visible = inside & (points[..., 2][:, None] <= front + HIDDEN_BEHIND) & (front > 0)
@@ -295,7 +295,7 @@ class PhotoDetail:
             cv2.grabCut(pixels, labels, (0, 0, 1, 1), back, front, 3, cv2.GC_INIT_WITH_MASK)
         result = torch.from_numpy(labels & 1).to(photo)[None, None]
         result = _ramp(avg_pool2d(result, 5, stride=1, padding=2, count_include_pad=False), 0.3, 0.8)
-        return _look_up(interpolate(result, (self.wide,) * 2, mode="bilinear"), self._place)
+        return look_up(interpolate(result, (self.wide,) * 2, mode="bilinear"), self._place)
 
     def _pixels(self) -> Float[Tensor, "1 2 g g"]:
         return _square(torch.arange(self.wide).float()).permute(0, 3, 1, 2).to(self.photo)
@@ -319,12 +319,6 @@ def _veiled(image: Tensor, veil: Tensor) -> Tensor:
 
 def _cleared(image: Tensor, veil: Tensor) -> Tensor:
     return (image - veil[:, 1:]) / (1 - veil[:, :1]).clamp(min=DARKEST) if veil.shape[1] else image
-
-
-def _look_up(maps: Tensor, place: Float[Tensor, "n 2 h w"], mode: str = "bilinear") -> Tensor:
-    """Maps at pixel coordinates."""
-    grid = place.permute(0, 2, 3, 1) * 2 / (maps.shape[-1] - 1) - 1
-    return sampled(maps, grid, mode=mode, padding_mode="border", align_corners=True)
 
 
 def _facing(points: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n h w"]:

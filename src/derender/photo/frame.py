@@ -160,6 +160,14 @@ def sampled(
     return grid_sample(maps, bands, align_corners=align_corners, **how).transpose(0, 1).flatten(1, 2)[None]
 
 
+def look_up(
+    maps: Float[Tensor, "n c h w"], place: Float[Tensor, "n 2 r k"], mode: str = "bilinear"
+) -> Float[Tensor, "n c r k"]:
+    """Square maps at pixel coordinates (across, down), as ``sampled`` does it."""
+    grid = place.permute(0, 2, 3, 1) * 2 / (maps.shape[-1] - 1) - 1
+    return sampled(maps, grid, mode=mode, padding_mode="border", align_corners=True)
+
+
 def _window(size: int) -> Float[Tensor, "s s"]:
     """1 inside a square, 0 at its border."""
     centres = (torch.arange(size) + 0.5) / size
