@@ -229,6 +229,28 @@ def ladder(result: Any) -> Iterator[list[str]]:
         yield [f"{name} (control)", "", side.get(name, ""), *scores]
 
 
+SEEDED = {
+    "31 people of LFW, Ward accuracy": ("published/lfw.json", "accuracy", "LFW accuracy"),
+    "31 people of LFW, NMI": ("published/lfw.json", "nmi", "LFW nmi"),
+    "pairs of LFW, accuracy": ("published/verification.json", "accuracy", "pairs accuracy"),
+    "pairs of LFW, area under the curve": ("published/verification.json", "auc", "pairs auc"),
+    "Yale B, light from 25 to 50 degrees": ("published/identity.json", "<= 50", "Yale B <= 50"),
+    "Yale B, 50 to 77 degrees": ("published/identity.json", "<= 77", "Yale B <= 77"),
+    "Yale B, beyond": ("published/identity.json", "beyond", "Yale B beyond"),
+    "Yale B, Ward accuracy": ("published/identity.json", "ward accuracy", "Yale B ward accuracy"),
+}
+
+
+def seeds(result: Any) -> Iterator[list[str]]:
+    """Means and deviations over trainings that differ in their seed, the released model, the best control."""
+    yield ["", f"{len(result['rows'])} seeds", "`faces-64`", "best control"]
+    for name, (file, key, column) in SEEDED.items():
+        rows = kept(file)["rows"].values()
+        control = max(row["scores"][key]["value"] for row in rows if row["control"])
+        cells = spread([row[column] for row in result["rows"]], 3), f"{result['released'][column]:.3f}"
+        yield [name, *cells, f"{control:.3f}"]
+
+
 def sharp(result: Any) -> Iterator[list[str]]:
     """Reconstructions at 128 pixels of models of two sizes."""
     first, *_ = result["rows"].values()
@@ -362,6 +384,7 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     ),
     "paper-linear": ("published/compare-linear.json", theirs.few_labels),
     "paper-gpu": ("paper-gpu.json", theirs.preset),
+    "seeds": (" ".join(("seeds.json", *dict.fromkeys(file for file, *_ in SEEDED.values()))), seeds),
     "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
     "demo": ("demo.json", demo),
     "renderers": ("renderers_fit.json", drawn.renderers),
