@@ -48,6 +48,7 @@ def test_what_is_visible_of_a_part_holds_all_that_shows_the_photograph(frame):
     hidden[:, rows, columns] = 0
     assert hidden.max() == 0
     assert (rows.stop - rows.start) * (columns.stop - columns.start) < 60 * 60
+    assert Frame(-500, 20, 40).visible(60, 40, 60) == (slice(0, 60), slice(56, 60))  # beside it
 
 
 @pytest.mark.parametrize("frame", [Frame(30, 20, 24), Frame(30.4, 20.7, 21.5, 25.0), Frame(2, 2, 30)])

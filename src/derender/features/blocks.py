@@ -145,13 +145,8 @@ def ray_blocks(
 
 PLAN, PARTS_FORMAT = "plan.json", 2
 _KEY = b"derender part"
-_BEGUN = (
-    LOCK_FILE,
-    PLAN,
-    f".{PLAN}",
-    "writing.parquet",
-    ".writing.parquet",
-)  # of a run killed before its first part
+# of a run killed before its first part
+_BEGUN = (LOCK_FILE, PLAN, f".{PLAN}", "writing.parquet", ".writing.parquet")
 
 Rows = tuple[pa.Table, Mapping[str, Any]]
 """Rows of an unfinished table, and what else is known: the first sample ``following``, unreadable images

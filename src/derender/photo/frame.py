@@ -89,7 +89,8 @@ class Frame:
         places = np.array([(c * y - s * x, c * x + s * y) for x, y in ends]) / self.side + 0.5
         low = np.floor(places.min(axis=0) * size / BESIDE - 1) * BESIDE
         high = np.ceil(places.max(axis=0) * size / BESIDE + 1) * BESIDE
-        first, last = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
+        first = np.clip(low, 0, size - BESIDE).astype(int).tolist()
+        last = np.clip(high, BESIDE, size).astype(int).tolist()
         return slice(first[0], last[0]), slice(first[1], last[1])
 
     def cut(self, photo: UInt8[np.ndarray, "h w 3"], size: int) -> UInt8[np.ndarray, "3 size size"]:
