@@ -12,8 +12,8 @@ from typing import Any
 import paper_rows as theirs
 import renderer_tables as drawn
 import speed_tables as speed
+import training_tables as trained
 from paper_rows import kept
-from renderer_tables import spread
 from side_by_side import CARS, HEADS_FILE, LFW, SIDE_BY_SIDE, Reader
 
 from derender.evaluation.paper_tables import SEGMENTATION
@@ -199,58 +199,6 @@ def probed(result: Any) -> Iterator[list[str]]:
             yield [f"{part['head']}, {part['labels']:,}", *(f"{score:.3f}" for score in scores)]
 
 
-RUNGS = {
-    "r0": "reconstruction alone", "r1": "+ LOOCC as in the paper", "r2": "+ template start",
-    "r3": "+ cycle term", "r4": "+ stronger LOOCC", "r5": "+ whitening", "r6": "+ distillation",
-    "r7": "+ 60 steps per image",
-}  # fmt: skip
-LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi"}
-LADDER_DEPTH = {"average depth": "average depth", "untrained encoder": "untrained model"}
-
-
-def ladder(result: Any) -> Iterator[list[str]]:
-    """Means and deviations over the seeds that did not collapse, then controls."""
-    keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3}
-    yield ["each row adds to the one above", "whole runs", "SIDE x 100", "tracks, NMI", "LFW, NMI"]
-    for rung, name in RUNGS.items():
-        seeds = [row for row in result["rows"] if row["rung"] == rung]
-        whole = [row for row in seeds if not row["collapsed"]]
-        values = {key: [row[key] for row in whole if key in row] for key in keys}
-        cells = (spread(values[key], digits) if values[key] else "" for key, digits in keys.items())
-        yield [name, f"{len(whole)} of {len(seeds)}", *cells]
-    controls = {file: kept(file)["rows"] for file in LADDER_CONTROLS}
-    depth = kept("generated/heads.json")["intervals"]["geometry"]
-    side = {name: f"{100 * depth[row]['scores']['side']['value']:.2f}" for name, row in LADDER_DEPTH.items()}
-    yield ["average depth (control)", "", side["average depth"], "", ""]
-    for name in ("untrained encoder", "PCA (64)", "pixels"):
-        scores = (
-            f"{controls[file][name]['scores'][key]['value']:.3f}" for file, key in LADDER_CONTROLS.items()
-        )
-        yield [f"{name} (control)", "", side.get(name, ""), *scores]
-
-
-SEEDED = {
-    "31 people of LFW, Ward accuracy": ("published/lfw.json", "accuracy", "LFW accuracy"),
-    "31 people of LFW, NMI": ("published/lfw.json", "nmi", "LFW nmi"),
-    "pairs of LFW, accuracy": ("published/verification.json", "accuracy", "pairs accuracy"),
-    "pairs of LFW, area under the curve": ("published/verification.json", "auc", "pairs auc"),
-    "Yale B, light from 25 to 50 degrees": ("published/identity.json", "<= 50", "Yale B <= 50"),
-    "Yale B, 50 to 77 degrees": ("published/identity.json", "<= 77", "Yale B <= 77"),
-    "Yale B, beyond": ("published/identity.json", "beyond", "Yale B beyond"),
-    "Yale B, Ward accuracy": ("published/identity.json", "ward accuracy", "Yale B ward accuracy"),
-}
-
-
-def seeds(result: Any) -> Iterator[list[str]]:
-    """Means and deviations over trainings that differ in their seed, the released model, the best control."""
-    yield ["", f"{len(result['rows'])} seeds", "`faces-64`", "best control"]
-    for name, (file, key, column) in SEEDED.items():
-        rows = kept(file)["rows"].values()
-        control = max(row["scores"][key]["value"] for row in rows if row["control"])
-        cells = spread([row[column] for row in result["rows"]], 3), f"{result['released'][column]:.3f}"
-        yield [name, *cells, f"{control:.3f}"]
-
-
 def sharp(result: Any) -> Iterator[list[str]]:
     """Reconstructions at 128 pixels of models of two sizes."""
     first, *_ = result["rows"].values()
@@ -384,8 +332,8 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     ),
     "paper-linear": ("published/compare-linear.json", theirs.few_labels),
     "paper-gpu": ("paper-gpu.json", theirs.preset),
-    "seeds": (" ".join(("seeds.json", *dict.fromkeys(file for file, *_ in SEEDED.values()))), seeds),
-    "ladder": (" ".join(("ladder.json generated/heads.json", *LADDER_CONTROLS)), ladder),
+    "seeds": (" ".join(("seeds.json", *trained.SEEDED_FILES)), trained.seeds),
+    "ladder": (" ".join(("ladder.json generated/heads.json", *trained.LADDER_CONTROLS)), trained.ladder),
     "demo": ("demo.json", demo),
     "renderers": ("renderers_fit.json", drawn.renderers),
     "renderers-speed": ("renderers_speed.json", drawn.renderer_speed),

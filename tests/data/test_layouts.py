@@ -1,7 +1,7 @@
 """Every layout on tiny trees as its owners publish it: recognised, named, labels read, faults named."""
 
-import io
-import math
+from io import BytesIO
+from math import nan, pi
 
 import numpy as np
 import pyarrow as pa
@@ -14,8 +14,6 @@ from derender.data.image import decode
 from derender.data.layouts.faces import EMOTIONS
 from derender.data.layouts.rendered import CAR_CLASSES
 from derender.data.layouts.tables import label_column
-
-NAN = math.nan
 
 
 def images(*names: str) -> dict[str, None]:
@@ -109,7 +107,7 @@ TREES = {
 
 def as_parquet() -> bytes:
     """The table of ``LISTED``, with its ages as numbers."""
-    stored = io.BytesIO()
+    stored = BytesIO()
     columns = {
         "path": ["a b/1.png", "ünï/2.png", "new\nline.png"], "age": [31, None, 4.5],
         "kind": ["cat", "dog, big", None], "smiles": ["yes", None, "no"],
@@ -148,16 +146,16 @@ def test_recognised_wherever_the_tree_lies(tree, name, files, zipped, wrapped):
         assert len(column) == len(result.table.files) > 0
 
 
-RADIANS = {"light_pitch_rad": [math.pi / 6, 0], "light_yaw_rad": [-math.pi / 4, 0]}
-RADIANS |= {f"camera_{axis}_rad": [math.pi / part, 0] for axis, part in (("x", 18), ("y", 9), ("z", 36))}
+RADIANS = {"light_pitch_rad": [pi / 6, 0], "light_yaw_rad": [-pi / 4, 0]}
+RADIANS |= {f"camera_{axis}_rad": [pi / part, 0] for axis, part in (("x", 18), ("y", 9), ("z", 36))}
 OLD = images(*(f"{name}_20170116184028385.jpg" for name in ("116_3_4", "117_0_0", "53__0", "7_1_5")))
 YOUNG = images(*(f"{age}_0_2_{CHIP}" for age in range(10, 30)), "stray.jpg")
 KNOWN = {  # files, how they are read; labels, and partition
     "utkface": (UTKFACE, {}, {"age": [100, 24, 39, 55], "gender": ["female", "male", "female", "male"],
         "race": ["white", "black", "", ""]}, None),
-    "utkface codes": (OLD, {}, {"age": [116, NAN, 53, 7], "gender": ["", "male", "", "female"],
+    "utkface codes": (OLD, {}, {"age": [116, nan, 53, 7], "gender": ["", "male", "", "female"],
         "race": ["other", "white", "white", ""]}, None),
-    "utkface stray": (YOUNG, {}, {"age": [*range(10, 30), NAN]}, None),
+    "utkface stray": (YOUNG, {}, {"age": [*range(10, 30), nan]}, None),
     "lfw": (LFW, {}, {"identity": ["Ann_Lee", "Bo", "Cy_X"]}, None),
     "yaleb": ({**YALE, "yaleB02_P00_Ambient.pgm": None}, {"dataset": "yaleb"}, {"identity": ["yaleB02"] * 3,
         "light_azimuth_deg": [0, 120, -50], "light_elevation_deg": [0, -20, 0],
@@ -174,15 +172,15 @@ KNOWN = {  # files, how they are read; labels, and partition
         "list_attr_celeba.csv": "image_id,Bald\n000001.jpg,1\n",
         "list_eval_partition.csv": "image_id,partition\n000001.jpg,2\n"}, {}, {"Bald": [1]}, ["test"]),
     "celeba both": ({**WILD, **ALIGNED}, {}, {"Bald": [0, 1, -1]}, None),
-    "synface": (SYNFACE, {}, {"identity": ["7", "8"], "expression": ["happy", "sad"], "strength": [0.5, NAN],
+    "synface": (SYNFACE, {}, {"identity": ["7", "8"], "expression": ["happy", "sad"], "strength": [0.5, nan],
         "ambient": [0.3, 0.3], "camera_tx": [0.001, 0], **RADIANS}, ["train", "train"]),
     "synface subset": (SYNFACE, {"subset": "test_gt"}, {"identity": ["9"]}, ["test_gt"]),
     "synface no row": ({**SYNFACE, "train/images/000002.jpg": None}, {}, {"identity": ["7", "8", ""],
-        "ambient": [0.3, 0.3, NAN]}, ["train"] * 3),
+        "ambient": [0.3, 0.3, nan]}, ["train"] * 3),
     "synface pandas": ({**SYNFACE,
         "train/params.csv": ',file,expression\n0,images/000000.jpg,"two\nlines"\n'}, {},
         {"expression": ["two\nlines", ""]}, ["train"] * 2),
-    "syncar": (SYNCAR, {}, {"class": ["taxi"], "model": ["a/b"], "elevation_rad": [math.pi / 2]}, ["train"]),
+    "syncar": (SYNCAR, {}, {"class": ["taxi"], "model": ["a/b"], "elevation_rad": [pi / 2]}, ["train"]),
     "tracks": ({**TRACKS, "params.csv": PARAMS + FIRST.replace("images/000000", "tracks/id1/track_000/000")},
         {}, {"identity": ["id1", "id1", "id2"], "track": ["id1/track_000", "id1/track_001", "id2/track_000"],
         "expression": ["happy", "", ""]}, None),
@@ -208,10 +206,10 @@ KNOWN = {  # files, how they are read; labels, and partition
         "frame_01"], "track": ["Ann/0", "Ann/1", "Bo/0", "Bo/track_002"]}, None),
     "unnumbered": (images("Ann/kitchen/x.jpg", "Bo/bar/y.jpg"), {"dataset": "face_tracks"},
         {"track": ["Ann/kitchen", "Bo/bar"]}, None),
-    "csv": (TABLE, {}, {"age": [31, NAN, 4.5], "kind": ["cat", "dog, big", ""], "smiles": [1, -1, 0],
+    "csv": (TABLE, {}, {"age": [31, nan, 4.5], "kind": ["cat", "dog, big", ""], "smiles": [1, -1, 0],
         "id": ["007", "12", "9"]}, ["train", "validation", "test"]),
     "parquet": ({**images("a b/1.png", "ünï/2.png", "new\nline.png"), "data.parquet": as_parquet()}, {},
-        {"age": [31, NAN, 4.5], "smiles": [1, -1, 0], "id": ["007", "12", "9"]}, ["train", "validation",
+        {"age": [31, nan, 4.5], "smiles": [1, -1, 0], "id": ["007", "12", "9"]}, ["train", "validation",
         "test"]),
     "own split": ({"a/metadata.csv": "file_name,x,split\n1.png,3,one\n./2.png,4,two\n", **images("a/1.png",
         "a/2.png")}, {}, {"x": [3, 4], "split": ["one", "two"]}, None),
@@ -315,7 +313,7 @@ def test_faults_of_addresses_archives_and_nested_columns(tree, tmp_path, encoded
     for source in (tmp_path / "empty", tree([], zipped=True, name="nothing")):
         with pytest.raises(ValueError, match=r"no images found in .*found no files at all"):
             list_images(source)
-    stored = io.BytesIO()
+    stored = BytesIO()
     pq.write_table(pa.table({"image": [{"bytes": encoded(1), "path": "1.png"}]}), stored)
     nested = tree({"data.parquet": stored.getvalue(), "1.png": None}, name="nested")
     with pytest.raises(ValueError, match=r"column 'image' of data\.parquet .* struct<.*kept inside a table"):
@@ -327,7 +325,7 @@ def test_faults_of_addresses_archives_and_nested_columns(tree, tmp_path, encoded
     [
         (["True", "no", "NO", ""], np.array([1, 0, 0, -1], np.int8)),
         (["1", "0", "2"], np.array([1, 0, 2], np.float32)),
-        (["-1", "1.5e3", ""], np.array([-1, 1500, NAN], np.float32)),
+        (["-1", "1.5e3", ""], np.array([-1, 1500, nan], np.float32)),
         (["01", "2"], np.array(["01", "2"])),
         (["16777217", "2"], np.array(["16777217", "2"])),
         (["16777216", "2"], np.array([16777216, 2], np.float32)),
@@ -382,8 +380,8 @@ def test_celeba_in_the_wild_is_cropped_by_landmarks(tree, encoded, tmp_path):
         assert "no usable box is known" in pictures.skipped[0].reason
         assert (pictures.images == np.stack(expected)).all()
     tree({"list_landmarks_celeba.txt": LANDMARKS.replace("20 30 30 30", "22 30 32 30")})
-    second = read_images(source, 10, cache=tmp_path / "cache").images
-    assert (second[0] != expected[0]).any() and (second[1] == expected[1]).all()
+    moved, same = read_images(source, 10, cache=tmp_path / "cache").images[:2]
+    assert (moved != expected[0]).any() and (same == expected[1]).all()
     for own, last in ((SIZED + "000003.jpg,-5,-4,30,30\n", [-5, -4, 25, 26]), (SIDES, [0, 0, 40, 30])):
         boxes = [[2, 3, 22, 33], [5, 1, 25, 21], last]  # of a list of one's own, which may stick out a little
         assert found_in(tree({"boxes.csv": own})).table.boxes.tolist() == boxes

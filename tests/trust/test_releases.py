@@ -131,7 +131,7 @@ def test_what_comes_from_the_future_is_refused(copy, read, place, change):
 
 
 def test_a_run_from_the_future_and_one_from_before_formats_were_counted(copy):
-    """The format speaks before a setting that nobody knows yet does."""
+    """The format speaks before a setting that is not known yet does."""
     file = copy / "run" / "config.yaml"
     text = file.read_text()
     assert text.startswith("format: 1\n")
