@@ -189,18 +189,19 @@ class EmbeddingModel(nn.Module):
         images = as_batch(images, self.image_size, next(self.parameters()).device)
         if self.whitening is None and not self.features.fits_scenes:
             return self.encode(images)
-        return self.features_from(self.activations(images))
+        return self.features_from(self.activations(images, codes=False))
 
-    def activations(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n _"]]:
-        """Encoder activations of images in 0..1, by factor: the code, then the last spatial map.
+    def activations(self, images: Float[Tensor, "n 3 h w"], codes: bool = True) -> dict[str, Tensor]:
+        """Encoder activations (N, D) of images in 0..1, by factor: the code, then the last spatial map.
 
         Where ``features`` needs them, the mirror image's follow, and the fitted scene's under
-        `coordinates_of`.
+        `coordinates_of`. Without ``codes`` factors whose features take another crop or view lack theirs.
         """
         check_images(images, self.image_size)
         framing = None if self.whitening is None else self.whitening.framing
         framed = None if framing is None else framing(images)
-        result = {f.name: self.factor_activations(f.name, images, framed=framed) for f in self.factors}
+        known: dict[str, Any] = {"framed": framed, "codes": codes}
+        result = {f.name: self.factor_activations(f.name, images, **known) for f in self.factors}
         if self.features.fits_scenes:
             steps = self.features.required_fitting().settings.steps
             fitted = self._fitted(images if framed is None else framed, steps).coordinates
@@ -209,20 +210,20 @@ class EmbeddingModel(nn.Module):
 
     def factor_activations(
         self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None,
-        framed: Float[Tensor, "n 3 h w"] | None = None,
+        framed: Float[Tensor, "n 3 h w"] | None = None, codes: bool = True,
     ) -> Float[Tensor, "n _"]:  # fmt: skip
         """``activations`` for one factor, without coordinates.
 
-        Where ``features`` take another crop or the canonical view, its activations follow the code.
-        ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default where
-        ``features`` take them. ``framed`` are the images in their crops, if they are known.
+        Where ``features`` take another crop or the canonical view, its activations follow the code, if
+        ``codes``. ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default
+        where ``features`` take them. ``framed`` are the images in their crops, if they are known.
         """
         net, parts = dict[str, Any](self.nets)[name], list[Tensor]()
         framing, shown = self.features.framing(name), images
         if framing is not None:
             shown = framing(images) if framed is None else framed
         shown = self.frontal(shown) if self.features.turns(name) else shown
-        code = [] if shown is images else [net.encoder(images)]
+        code = [net.encoder(images)] if codes and shown is not images else []
         shown = reduced(shown, self.settings.network)
         for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
             parts += [*code, activated := net.activations(one)]
@@ -265,9 +266,8 @@ class EmbeddingModel(nn.Module):
     def fit_scenes(self, images: GivenImages, steps: int = STEPS) -> Fitted:
         """Scenes optimised per image, from ``decompose`` on, downhill through the renderer.
 
-        Some five times as slow as ``decompose``, with a smaller error, also under other lighting and
-        viewpoints. On a CPU an image's scene is the same whatever images stand beside it, on any number of
-        threads. A model without a fitting (``derender whiten`` makes one) is a ValueError.
+        Some five times as slow as ``decompose``, with a smaller error. On a CPU neither other images nor
+        threads matter. A model without a fitting (``derender whiten`` makes one) is a ValueError.
         """
         return self._fitted(as_batch(images, self.image_size, next(self.parameters()).device), steps)
 
