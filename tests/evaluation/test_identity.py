@@ -6,7 +6,7 @@ from sklearn.metrics import roc_auc_score
 
 from derender.baselines.controls import DESCRIPTORS, descriptor_features
 from derender.data import ImageSet, half_of
-from derender.evaluation.feature_rows import control_rows
+from derender.evaluation.feature_rows import FeatureRow, control_rows
 from derender.evaluation.identity import area_under_roc, identify, read_pairs, verify
 from derender.evaluation.options import Options
 from derender.features import FeatureTable
@@ -74,7 +74,7 @@ def written(path, folds=10, count=6) -> str:
     return str(path)
 
 
-def test_pairs_are_judged_by_a_threshold_from_other_folds(tmp_path, codes):
+def test_pairs_are_judged_by_a_threshold_from_other_folds(tmp_path, codes, monkeypatch):
     pairs = read_pairs(written(tmp_path / "pairs.txt"))
     assert len(pairs) == 120 and pairs.first[1] == "P1_0002" and pairs.second[6] == "P1_0002"
     exact = np.repeat(np.eye(PEOPLE), SHOTS, axis=0)
@@ -87,6 +87,10 @@ def test_pairs_are_judged_by_a_threshold_from_other_folds(tmp_path, codes):
     chance = verify(table(noise), kept, factors=("code",), resamples=50, cache="none").values
     assert chance["rows"]["code"]["scores"]["accuracy"]["value"] == pytest.approx(0.5, abs=0.12)
     assert 0.01 < chance["standard_error"]["code"] < 0.1
+    runs = FeatureRow("code", tuple(table(RNG.standard_normal((PEOPLE * SHOTS, 8))) for _ in range(3)))
+    monkeypatch.setattr("derender.evaluation.identity.subject_and_controls", lambda *_: [runs])
+    several = verify(runs.tables[0], kept, resamples=50, cache="none").values["rows"]["code"]["scores"]
+    assert all(0 < several[name]["spread"] < 0.15 for name in ("accuracy", "auc"))
 
 
 def test_pairs_of_a_half_have_all_people_in_it_and_are_balanced(tmp_path, codes):

@@ -230,7 +230,7 @@ def verify(
         right = np.mean([own for own, _ in runs], axis=0)
         accuracy = weights @ right / weights.sum(axis=1)
         areas = np.stack([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs])
-        scores = {"accuracy": bootstrap.estimate(accuracy[:1], accuracy[1:])}
+        scores = {"accuracy": bootstrap.estimate([own.mean() for own, _ in runs], accuracy[1:])}
         scores["auc"] = bootstrap.estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
         each = [float(right[pairs.fold == fold].mean()) for fold in np.unique(pairs.fold)]
         errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
