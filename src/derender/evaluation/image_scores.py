@@ -47,10 +47,11 @@ class ImageResult:
             for row, one in self.named().items()
         }
 
-    def rows(self, resample_count: int = bootstrap.RESAMPLES) -> tuple[bootstrap.ScoredRow, ...]:
+    def rows(self, count: int = bootstrap.RESAMPLES, seed: int = 0) -> tuple[bootstrap.ScoredRow, ...]:
         """The model, then its controls, with intervals."""
-        count = len(next(iter(self.each()["model"].values())))
-        return image_rows(self.each(), self.columns, bootstrap.once_and_resampled(count, resample_count))
+        each = self.each()
+        weights = bootstrap.once_and_resampled(len(next(iter(each["model"].values()))), count, seed)
+        return image_rows(each, self.columns, weights)
 
     def table(self, rows: Sequence[bootstrap.ScoredRow] | None = None) -> ScoreTable:
         """The scores in the units of the columns; with ``rows``, their intervals too."""

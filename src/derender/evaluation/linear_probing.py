@@ -219,7 +219,7 @@ def compare_linear(
     """
     feature_rows.check_lengths(features, len(task))
     truth = task.targets[rows.test]
-    weights = bootstrap.once_and_resampled(len(rows.test), resample_count)
+    weights = bootstrap.once_and_resampled(len(rows.test), resample_count, seeds[0])
 
     def scored(name: str, answers: np.ndarray) -> bootstrap.ScoredRow:
         """Scores of (S, T, A) answers; average precision has no interval."""

@@ -96,9 +96,7 @@ class Options:
         """The images at a side in pixels, read once for each; with ``files`` these, in this order."""
         if image_size not in self._read:
             assert self.images is not None
-            how: dict[str, Any] = {
-                name: getattr(self, name) for name in ("dataset", "limit", "keep_duplicates")
-            }
+            how = {name: getattr(self, name) for name in ("dataset", "limit", "keep_duplicates")}
             result = as_images(self.images, image_size, **how, progress=self.stage("reading"))
             if result.images.shape[-1] != image_size:
                 raise ValueError(

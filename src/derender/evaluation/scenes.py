@@ -119,7 +119,7 @@ def _scored(model: Derenderer, protocols: Protocols, inputs: Mapping[str, Any], 
     settings = model.settings.model_dump(mode="json")
     inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
     result = {name: how.memory.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
-    rows = {name: one.rows(how.resamples) for name, one in result.items()}
+    rows = {name: one.rows(how.resamples, how.seed) for name, one in result.items()}
     asked = [(rows[name][0], one.columns) for name, one in result.items()]
     notes = [verdict(row, *column) for row, columns in asked for column in columns.items()]
     intervals = {name: numbers_of(scored) for name, scored in rows.items()}

@@ -19,7 +19,7 @@ import numpy as np
 from derender.data import read_masks
 from derender.data.source import evenly_spaced
 from derender.evaluation import segmenters
-from derender.evaluation.bootstrap import ScoredRow, once_and_resampled, scored_row, with_verdicts
+from derender.evaluation.bootstrap import ScoredRow, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
@@ -185,7 +185,7 @@ def segment(
         losses = segmenters.train_segmenter(net, data, seed, settings, step)
         return {**counted(segmenters.answer(net, data.images[data.test])), "losses": np.array(losses)}
 
-    weights = once_and_resampled(len(data.test), how.resamples)
+    weights = how.drawn(len(data.test))
 
     def row(title: str, control: bool, runs: list[dict[str, np.ndarray]], trainable: int) -> SegmentationRow:
         result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
