@@ -82,7 +82,7 @@ def measure(name: str, size: int, batch: int, precision: str, rounds: int) -> di
     if apart > most[0] or gradient > most[1]:
         raise SystemExit(f"{name}, {size} px: losses differ by {apart:.1e}, gradients by {gradient:.1e}")
     taken: dict[str, list[float]] = {"eager": [], "compiled": []}
-    with freed_memory_kept():
+    with freed_memory_kept(torch.device("cpu")):
         for turn in range(rounds + 1):
             for way, step in (("eager", eager), ("compiled", compiled)):
                 step(images)

@@ -42,7 +42,7 @@ def group_of(operator: str) -> str:
 def measure(preset: str, size: int, batch: int, steps: int) -> dict[str, Any]:
     images = torch.rand(batch, 3, size, size, generator=torch.Generator().manual_seed(0))
     _, step = step_of(preset, size, "32-true", training_step)
-    with freed_memory_kept():
+    with freed_memory_kept(torch.device("cpu")):
         step(images)
         with FlopCounterMode(display=False) as counted:
             step(images)

@@ -13,10 +13,10 @@ from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 
 BUDGET = {  # lines, files
     "data": (6_980, 30),
-    "evaluation": (7_300, 32),  # ridge regression in closed form
+    "evaluation": (7_295, 32),  # ridge regression in closed form
     "report": (3_985, 24),  # images that do not suit a model are left out
     "cli": (2_295, 32),  # the same
-    "training": (3_615, 19),  # CUDA graphs; networks compiled if asked; the framing network
+    "training": (3_620, 19),  # CUDA graphs; networks compiled if asked; the framing network
     "baselines": (2_425, 11),
     "render": (1_705, 15),  # unwarp
     "features": (1_310, 8),  # a folder is refused before images are embedded
@@ -32,7 +32,7 @@ BUDGET = {  # lines, files
     "learn": (920, 5),
 }
 TOTAL = (39_311, 241)  # on the way to (37_000, 270)
-TEST_LINES = 25_989
+TEST_LINES = 25_991
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -39,8 +39,10 @@ def faults():  # minor ones, while a block of 64 MB is filled and freed twenty t
     [torch.ones(16 * 2**20) is None for _ in range(20)]
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 outside = faults()
-with freed_memory_kept() as kept:
+cpu = torch.device("cpu")
+with freed_memory_kept(cpu) as kept, freed_memory_kept(cpu) as twice:
     print(int(kept), outside, faults(), flush=True)
+assert not twice
 from derender.training.distributed import open_fabric
 assert open_fabric("cpu").world_size == 1 and "torchmetrics" not in sys.modules
 from torchmetrics.functional.classification import multiclass_stat_scores

@@ -11,7 +11,6 @@ at a place already draws a face; principal components also hold its pose.
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -260,7 +259,7 @@ def train_segmenter(
     optimiser = torch.optim.Adam(learning, lr=settings.learning_rate, betas=settings.betas, fused=True)
     generator, seen, means = torch.Generator().manual_seed(seed), 0, []
     batch_size = settings.batch_for(len(data.train))
-    with freed_memory_kept() if net.device.type == "cpu" else nullcontext():
+    with freed_memory_kept(net.device):
         for _ in range(settings.epochs):
             order = data.train[torch.randperm(len(data.train), generator=generator).numpy()]
             total = 0.0

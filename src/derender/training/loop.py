@@ -8,7 +8,6 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from functools import partial
 from itertools import count, groupby, takewhile
 from math import isfinite
@@ -57,7 +56,7 @@ def train_task(task: TrainingTask, images: ImageSet, out: str | Path, **how: Any
     images.require(10)
     with process.deterministic_algorithms(task.config.deterministic), process.locked(Path(out)):
         run = _Run(task, images, Path(out), **how)
-        with process.freed_memory_kept() if run.fabric.device.type == "cpu" else nullcontext():
+        with process.freed_memory_kept(run.fabric.device):
             return run.go_on()
 
 

@@ -20,9 +20,10 @@ from filelock import FileLock, Timeout
 
 from derender.training.distributed import this_rank_writes
 
-_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # numbers of mallopt's parameters in glibc's malloc.h
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4  # numbers of mallopt's parameters in malloc.h
 _KEEP = {_TRIM_THRESHOLD: -1, _MMAP_MAX: 0}  # never trim; no blocks of their own mapping
-_DEFAULT = {_TRIM_THRESHOLD: 128 * 1024, _MMAP_MAX: 65_536}
+_USUAL = {_TRIM_THRESHOLD: 64 << 20, _MMAP_THRESHOLD: 32 << 20, _MMAP_MAX: 65_536}  # where glibc's settle
+_kept = threading.Lock()
 
 LOCK_FILE = "run.lock"
 
@@ -53,11 +54,12 @@ def stop_on_signal() -> Iterator[threading.Event]:
 
 @contextmanager
 def evaluating(model: Any) -> Iterator[None]:
-    """The model in evaluation mode within the block, and afterwards as it was."""
-    was_training = model.training
+    """The model in evaluation mode within the block, then as it was; meanwhile `freed_memory_kept`."""
+    was_training, device = model.training, next(model.parameters(), torch.empty(0)).device
     model.eval()
     try:
-        yield
+        with freed_memory_kept(device):
+            yield
     finally:
         model.train(was_training)
 
@@ -77,22 +79,23 @@ def deterministic_algorithms(deterministic: bool) -> Iterator[None]:
 
 
 @contextmanager
-def freed_memory_kept() -> Iterator[bool]:
-    """Have glibc reuse freed memory instead of returning it; gives whether it could be configured so.
+def freed_memory_kept(device: torch.device) -> Iterator[bool]:
+    """Have glibc reuse freed memory instead of returning it, on a CPU; gives whether that begins here.
 
     glibc returns every freed large block, and the system fills it with zeros when it is needed again: up to a
-    third of a training step on a CPU. Other allocators, and memory of other devices, stay as they are.
+    third of a training step, half of an embedding. Nothing changes for other allocators, on other devices
+    and within another such block.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
-    if mallopt is None:
+    if mallopt is None or device.type != "cpu" or not _kept.acquire(blocking=False):
         yield False
         return
-    accepted = [mallopt(parameter, value) for parameter, value in _KEEP.items()]
     try:
-        yield all(accepted)
+        yield min(mallopt(parameter, value) for parameter, value in _KEEP.items()) == 1
     finally:
-        for parameter, value in _DEFAULT.items():
+        for parameter, value in _USUAL.items():
             mallopt(parameter, value)
+        _kept.release()
 
 
 @contextmanager
