@@ -349,6 +349,7 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "fitting": ("fitting.json", speed.fitting),
     "disentangle-speed": ("disentangle.json", speed.before),
+    "embedding-speed": ("embed_before.json", speed.before),
     "rasterize": ("rasterize.json", speed.rasterize),
     "peers": ("rasterize_peers.json", speed.peers),
     "step-memory": ("step_memory.json", speed.step_memory),

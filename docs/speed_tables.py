@@ -62,8 +62,12 @@ def fitting(result: Any) -> Iterator[list[str]]:
         yield [name, str(row["steps"]), f"{row['ms_per_image']:.1f}", *scores]
 
 
+BEFORE = {"evaluate": "`evaluate disentangle`, 400 images", "embed": "`embed --model faces-64`, 3,000 images"}
+
+
 def before(result: Any) -> Iterator[list[str]]:
-    yield ["`evaluate disentangle`, 400 images", "seconds", "least to most", "processor seconds", "ratio"]
+    what = BEFORE[result["command"].split()[0]]
+    yield [what, "seconds", "least to most", "processor seconds", "ratio"]
     first = result["rows"][0]["seconds"]
     for row, name in zip(result["rows"], (f"commit {result['commit']}", "now"), strict=True):
         ends = [f"{end(taken for taken, _ in row['rounds']):.0f}" for end in (min, max)]
