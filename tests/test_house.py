@@ -32,7 +32,7 @@ BUDGET = {  # lines, files
     "learn": (920, 5),
 }
 TOTAL = (39_311, 241)  # on the way to (37_000, 270)
-TEST_LINES = 25_991
+TEST_LINES = 25_992
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

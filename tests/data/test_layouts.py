@@ -75,9 +75,8 @@ BUFFY = "CVHCI_TRACKLABELS_V1\n1 giles\n13 buffy\n52 unknown_e02_8\n"
 EPISODES = {
     "ids/buffy.ids": BUFFY,
     "ids/bbt.ids": "CVHCI_TRACKLABELS_V1\n1 penny\n2 sheldon\n",
-    **images(
-        "bbt/00001/a b.jpg", "notes/x.jpg", *(f"buffy/{at}.jpg" for at in ("1/0001", "13/0002", "99/0001"))
-    ),
+    **images("bbt/00001/a b.jpg", "notes/x.jpg"),
+    **images(*(f"buffy/{at}.jpg" for at in ("1/0001", "13/0002", "99/0001"))),
 }
 NESTED = images("Ann/0/0.555.jpg", "Ann/1/0.1.jpg", "Bo/0/0.3.jpg", "Bo/track_002/frame_01.jpg")
 LISTED = (

@@ -162,6 +162,8 @@ class Both(ImageResult):
 
 def test_tables_are_in_the_units_of_their_columns():
     rows = Both().rows()
+    drawn = [Both().rows(20, seed)[0].scores["side"].resampled.tolist() for seed in (0, 0, 1)]
+    assert drawn[0] == drawn[1] != drawn[2]
     table = Both().table(rows)
     assert [column.name for column in table.columns] == ["SIDE x 100", "95 %", "MAD", "95 %", "coverage"]
     texts = [text for text, _ in table.texts(table.rows[0])]

@@ -266,8 +266,8 @@ class EmbeddingModel(nn.Module):
     def fit_scenes(self, images: GivenImages, steps: int = STEPS) -> Fitted:
         """Scenes optimised per image, from ``decompose`` on, downhill through the renderer.
 
-        Some five times as slow as ``decompose``, with a smaller error. On a CPU neither other images nor
-        threads matter. A model without a fitting (``derender whiten`` makes one) is a ValueError.
+        Some five times as slow as ``decompose``, with a smaller error. On a CPU a scene depends neither on
+        other images nor on threads. Without a fitting (``derender whiten`` makes one): a ValueError.
         """
         return self._fitted(as_batch(images, self.image_size, next(self.parameters()).device), steps)
 

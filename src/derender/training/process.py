@@ -83,8 +83,8 @@ def freed_memory_kept(device: torch.device) -> Iterator[bool]:
     """Have glibc reuse freed memory instead of returning it, on a CPU; gives whether that begins here.
 
     glibc returns every freed large block, and the system fills it with zeros when it is needed again: up to a
-    third of a training step, half of an embedding. Nothing changes for other allocators, on other devices
-    and within another such block.
+    third of a training step, two fifths of an embedding. Nothing changes for other allocators, on other
+    devices and within another such block.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
     if mallopt is None or device.type != "cpu" or not _kept.acquire(blocking=False):
