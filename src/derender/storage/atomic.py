@@ -11,9 +11,10 @@ import os
 import shutil
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from derender.storage.bounded import read_json
 
@@ -38,10 +39,7 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
     ``durable`` has the disk keep the content before the name. A link stays, and what it leads to is replaced.
     """
-    path = _linked(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _naming(path):
-        handle, name = tempfile.mkstemp(prefix=_prefix(path), dir=path.parent)
+    path, (handle, name) = _begun(path, tempfile.mkstemp)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -70,10 +68,8 @@ def atomic_folder(folder: Path, *, previous: Path | None = None) -> Iterator[Pat
     The old one becomes ``previous``, or is deleted. They are exchanged in one step where the system can
     (Linux); elsewhere the old one is moved first. A link stays, and what it leads to is replaced.
     """
-    folder = _linked(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with _naming(folder):
-        temporary = Path(tempfile.mkdtemp(prefix=_prefix(folder), dir=folder.parent))
+    folder, name = _begun(folder, tempfile.mkdtemp)
+    temporary = Path(name)
     aside = temporary.with_name(f"{temporary.name}-old") if previous is None else previous
     try:
         yield temporary
@@ -159,16 +155,12 @@ def measured(file: Path) -> tuple[int, int]:
     return size, checksum
 
 
-def _linked(path: Path) -> Path:
-    """What a link leads to, even where nothing is there yet; any other path as it is."""
-    return Path(os.path.realpath(path)) if path.is_symlink() else path
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Have errors of the system name this path instead of the temporary one beside it."""
+def _begun(path: Path, make: Callable[..., Any]) -> tuple[Path, Any]:
+    """The path, of a link what it leads to, and what ``make`` made beside it; errors name the former."""
+    path = Path(os.path.realpath(path)) if path.is_symlink() else path
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        yield
+        return path, make(prefix=_prefix(path), dir=path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
