@@ -64,7 +64,7 @@ def test_its_cost_is_that_of_the_features_it_gives(unpacked, pictures, tmp_path)
 
 
 def test_card_errors_and_split_go_along(tmp_path):
-    packed = pack_model("faces-64", tmp_path / "p").folder
+    pack_model("faces-64", packed := tmp_path / "p")
     own = load("faces-64").source
     assert own is not None
     for name in ("README.md", "held_out_errors.json", "split.json", "config.json"):

@@ -35,18 +35,17 @@ def pack(
         chosen = images.read(original.image_size, model=model.model, at_least=2)
     elif images != PartOfImages():
         raise ValueError("--dataset, --limit, --half and --part choose among images: give the images, too")
-    packed = pack_model(model.model, out, maps=maps, overwrite=output.force)
-    copy_split(packed.folder, model.model)
-    sizes = {"before": sum(packed.before.values()), "after": sum(packed.after.values())}
+    sizes = pack_model(model.model, out, maps=maps, overwrite=output.force)
+    copy_split(out, model.model)
     notice(f"{sizes['after'] / 1e6:,.2f} MB, before {sizes['before'] / 1e6:,.2f} MB")
-    values = {"model": packed.folder, "bytes": sizes}
+    values = {"model": out, "bytes": sizes}
     if chosen is not None:
-        copy = as_model(packed.folder, device=model.device)
+        copy = as_model(out, device=model.device)
         with progress_bar("comparing") as report:
             cost = copy_cost(original, copy, chosen.images, progress=report)
         moved = ", ".join(f"{name} {share:.2%}" for name, share in cost["moved"].items())
         notice(f"features moved, as a share of the distance between two images: {moved}")
         notice(f"reconstruction L1 {cost['l1']:.5f}, before {cost['l1_before']:.5f}")
         values |= {"pictures": len(chosen), "cost": cost}
-    output.result(f"model {packed.folder}")
+    output.result(f"model {out}")
     output.write(values)

@@ -8,7 +8,6 @@ import json
 import re
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -156,28 +155,19 @@ KINDS = ("bytes", "float16")
 _LARGE = re.compile(r"\w+_map|maps\.\w+_axes|framing\.weight\d")
 
 
-@dataclass(frozen=True)
-class Packed:
-    """What was written: the folder, and the bytes of the tensors' files by file, before and after."""
-
-    folder: Path
-    before: dict[str, int]
-    after: dict[str, int]
-
-
 def pack_model(
     source: str | Path, folder: str | Path, *, maps: str = "bytes", overwrite: bool = False
-) -> Packed:
+) -> dict[str, int]:
     """Write a model in fewer bytes, with what lies beside its weights; complete or not at all.
 
+    Gives the bytes of the tensors' files "before" and "after".
     ``maps`` are kept as "bytes", a 127th of the largest number of each slice apart, or "float16". A
     FileExistsError: ``folder`` exists, without ``overwrite``; a FileNotFoundError: no model is at ``source``;
     a ValueError: it is damaged, or a weight is no number of half precision.
     """
     require_known("kind of maps", maps, KINDS)
-    folder, own = Path(folder), model_folder(source)
+    own, sizes = model_folder(source), {"before": 0, "after": 0}
     files.read_config(own)
-    before, after = {}, {}
     with new_folder(folder, overwrite=overwrite) as temporary:
         for file in files.TENSOR_FILES:
             if not (own / file).is_file():
@@ -192,11 +182,12 @@ def pack_model(
                 elif _LARGE.fullmatch(name):
                     small[name] = _half(name, value)
             write_tensors(small, temporary / file, metadata)
-            before[file], after[file] = ((place / file).stat().st_size for place in (own, temporary))
+            sizes["before"] += (own / file).stat().st_size
+            sizes["after"] += (temporary / file).stat().st_size
         for file in (files.CONFIG_FILE, *files.TEXT_FILES):
             if (own / file).is_file():
                 (temporary / file).write_bytes(read_bounded(own / file))
-    return Packed(folder, before, after)
+    return sizes
 
 
 def _half(name: str, value: Tensor) -> Tensor:
