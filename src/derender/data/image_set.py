@@ -28,7 +28,7 @@ from derender.data.image import FITS, READER_VERSION, Unreadable, quiet_pillow
 from derender.data.layouts.layout import Labels, missing, text_column
 from derender.data.opening import open_images
 from derender.data.source import Skipped
-from derender.data.stream import Decoded, Kinds, Progress, Stream, column_of, decoded, estimated_total
+from derender.data.stream import Decoded, Progress, Stream, column_of, decoded, estimated_total, kinds_of
 from derender.storage.places import counted, require_known, suggestion
 
 
@@ -214,7 +214,6 @@ def read_images(
         result = _Found(keep_duplicates)
 
         def kept() -> Iterator[np.ndarray]:
-            """Decode everything, note it in ``found``, and yield the rows."""
             for chunk in chunks:
                 yield np.array([one.pixels for one in chunk if result.add(one)], np.uint8)
                 if progress is not None:
@@ -279,9 +278,7 @@ class _Found:
 
     def content(self) -> dict[str, Any]:
         """Everything, as JSON has it."""
-        kinds, partition = Kinds(), [one.partition for one in self.rows]
-        for one in self.rows:
-            kinds.see(one.labels)
+        kinds, partition = kinds_of(one.labels for one in self.rows), [one.partition for one in self.rows]
         return {
             "files": [one.file for one in self.rows],
             "skipped": list(map(asdict, self.skipped)),
@@ -295,10 +292,7 @@ def _joined(stream: Stream, images: np.ndarray, content: Mapping[str, Any]) -> I
     """The rows with their labels: those of the stream's table, or those that came with each."""
     files, partition = tuple(content["files"]), content["partition"]
     if stream.table is None:
-        labels = {
-            name: column_of(name, ({name: value} for value in values), kind)
-            for name, (kind, values) in content["labels"].items()
-        }
+        labels = {name: column_of(values, kind) for name, (kind, values) in content["labels"].items()}
         partition = None if partition is None else text_column(partition)
     else:
         row_of = {file: row for row, file in enumerate(stream.table.files)}

@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from derender.data.image import LARGE_BYTES, Unreadable, decode, one_large_image_at_a_time
-from derender.data.layouts.layout import Table, number_column, text_column
+from derender.data.layouts.layout import Table, text_column
 from derender.data.source import Closing, Skipped
 
 Value = str | int | float | bool | None  # one label of one image; None is unknown
@@ -81,30 +81,28 @@ def label_name(name: str) -> str:
     return "original_file" if name == "file" else name
 
 
-class Kinds(dict[str, str | None]):
-    """What each column of labels holds so far: "text", "number", "flag", or None while all is unknown.
+def kinds_of(rows: Iterable[Mapping[str, Value]]) -> dict[str, str | None]:
+    """What each column of labels holds: "text", "number", "flag", or None where all is unknown.
 
     A column of several kinds is text, and so are whole numbers that float32 cannot hold (above 2^24:
     identifiers, as a rule).
     """
+    kinds: dict[str, str | None] = {}
+    for name, value in chain.from_iterable(row.items() for row in rows):
+        kind, known = None, kinds.get(name)
+        if isinstance(value, bool):
+            kind = "flag"
+        elif value is not None:
+            large = isinstance(value, str) or (isinstance(value, int) and abs(value) > _EXACT_IN_FLOAT32)
+            kind = "text" if large else "number"
+        kinds[name] = kind if known is None else known if kind in (None, known) else "text"
+    return kinds
 
-    def see(self, labels: Mapping[str, Value]) -> None:
-        """Take one image's labels into account."""
-        for name, value in labels.items():
-            kind, known = None, self.get(name)
-            if isinstance(value, bool):
-                kind = "flag"
-            elif value is not None:
-                large = isinstance(value, str) or (isinstance(value, int) and abs(value) > _EXACT_IN_FLOAT32)
-                kind = "text" if large else "number"
-            self[name] = kind if known is None else known if kind in (None, known) else "text"
 
-
-def column_of(name: str, rows: Iterable[Mapping[str, Value]], kind: str | None) -> np.ndarray:
+def column_of(values: Iterable[Value], kind: str | None) -> np.ndarray:
     """One column of labels of a given kind; unknown values are "", NaN or -1."""
-    values = [row.get(name) for row in rows]
     if kind == "number":
-        return number_column(np.nan if value is None else float(value) for value in values)
+        return np.array([np.nan if value is None else float(value) for value in values], np.float32)
     if kind == "flag":
         return np.array([-1 if value is None else int(value) for value in values], np.int8)
     return text_column("" if value is None else str(value) for value in values)

@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 import torch
 
 from derender.data import ImageSet, Skipped, Unreadable, quiet_pillow
-from derender.data.stream import Decoded, Kinds, Sample, Stream, column_of, decode_samples, decoded
+from derender.data.stream import Decoded, Sample, Stream, column_of, decode_samples, decoded, kinds_of
 from derender.features.extract import as_batch, factor_codes
 from derender.features.parquet import factor_column, factor_values
 from derender.features.table import FeatureTable, check_finite
@@ -271,10 +271,8 @@ class Parts:
         self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None
     ) -> Iterator[FeatureTable]:
         """The finished table, part by part; labels are the ``known`` ones of all images, or the stream's."""
-        kinds = Kinds()
-        for (texts,) in self._read("labels") if known is None else ():
-            for text in texts.to_pylist():
-                kinds.see(json.loads(text))
+        columns = self._read("labels") if known is None else ()
+        kinds = kinds_of(json.loads(text) for (texts,) in columns for text in texts.to_pylist())
         names = sorted(kinds, key="partition".__ne__)  # the owners' split first
         for file in self.files:
             table = pq.read_table(file)
@@ -290,7 +288,7 @@ class Parts:
                 labels = {name: column[places] for name, column in known.items()}
             else:
                 rows = [json.loads(text) for text in table["labels"].to_pylist()]
-                labels = {name: column_of(name, rows, kinds[name]) for name in names}
+                labels = {name: column_of((row.get(name) for row in rows), kinds[name]) for name in names}
             yield FeatureTable(tuple(table["file"].to_pylist()), factors, labels, origin)
 
     def remove(self) -> None:
