@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from derender.data import list_images, open_source, read_images, read_masks
-from derender.data import opening as zip_source
+from derender.data import source as source_module
 
 ODD = ["ann lee", "ÄÖ ß 日本", "two\nlines", "quote\"'", "tab\there"]
 ZIPPED = pytest.mark.parametrize("zipped", [False, True])
@@ -70,7 +70,7 @@ def test_odd_names_reach_every_label(tree, zipped):
 
 def bomb(path: Path, name: str, monkeypatch) -> Path:
     """The zip with a member that unpacks to more than is allowed."""
-    monkeypatch.setattr(zip_source, "FILE_LIMIT_BYTES", 1 << 20)
+    monkeypatch.setattr(source_module, "FILE_LIMIT_BYTES", 1 << 20)
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, bytes(3 << 20))
     return path

@@ -20,7 +20,7 @@ import derender
 from derender.cli import main
 from derender.cli.console import show_scores
 from derender.data import read_images
-from derender.data.opening import ZipSource
+from derender.data.source import ZipSource
 from derender.data.synthetic.settings import FaceSettings, named_settings
 from derender.evaluation.angles import read_columns
 from derender.evaluation.identity import read_pairs

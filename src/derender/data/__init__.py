@@ -1,7 +1,7 @@
 """Images in: folders, zips, shards and published data sets, decoded once into one array or streamed.
 
-opening       from what the user wrote to a stream of images: open_images; zip archives
-source        named files; parquet files, their sizes checked before they are read
+opening       from what the user wrote to a stream of images: open_images
+source        named files, in folders and zips; parquet files, their sizes checked before they are read
 layouts/      how data sets lie: recognised, and read into a table of files and labels
 stream        images one after another, decoded on every core; streamed: WebDataset, Hugging Face
 image         decode one; images as a caller has them

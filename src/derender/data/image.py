@@ -34,8 +34,7 @@ from PIL import ExifTags, Image
 from PIL.Image import Resampling, Transpose
 from torch import Tensor
 
-from derender.data.source import FILE_LIMIT_BYTES
-from derender.storage.bounded import read_bounded
+from derender.storage.bounded import FILE_LIMIT_BYTES, read_bounded
 from derender.storage.places import nearest_sibling, require_known
 
 GivenImages: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor | Sequence[Any]

@@ -10,10 +10,11 @@ share v of the largest value is z = 1.1 - 0.2 v. The set does not state this; da
 """
 
 import io
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,10 +26,10 @@ from derender.data.image import DECODER_ERRORS, fit_square, quiet_pillow, uprigh
 from derender.data.image_set import ImageSet, read_images
 from derender.data.layouts import layout_named
 from derender.data.layouts.faces import MASK_CLASSES, parts_of
-from derender.data.layouts.layout import Labels, Table, half_of, stem_of
+from derender.data.layouts.layout import Labels, Table, half_of
 from derender.data.layouts.rendered import CAMERA, LIGHT, pairs_of, rendered_folders
 from derender.data.opening import ListedStream, half_named, open_images, open_source, parse_source
-from derender.data.source import Source, evenly_spaced
+from derender.data.source import Source, stem_of
 from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
 
@@ -140,10 +141,10 @@ def read_ground_truth(
     with open_source(Path(place).expanduser()) as opened:
         pairs = {} if rendered_folders(opened) else pairs_of(opened)
         layout = layout_named("depth_pairs" if pairs else "synface")
-        table = layout.read(opened, subset or named, default_parts=("test_gt", "test", "train"))
-        table = half_of(table, half_named(source, options))
+        layout = replace(layout, default_parts=("test_gt", "test", "train"))
+        table = half_of(layout.read(opened, subset or named), half_named(source, options))
         if pairs:
-            chosen = [table.files[row] for row in evenly_spaced(len(table.files), limit)]
+            chosen = table.at_most(limit).files
             return _read_pairs(opened, {file: pairs[file] for file in chosen}, image_size)
         return _read_maps(opened, table, limit)
 
@@ -183,14 +184,9 @@ def _merged(source: Source, files: dict[int, str]) -> UInt8[np.ndarray, "h w"]:
 def _named_alike(source: Source, images: tuple[str, ...]) -> list[str]:
     """The mask of every image by its path, else by its name where that is the only one."""
     by_path = {file.removesuffix(".png"): file for file in source.files if file.endswith(".png")}
-    by_stem: dict[str, list[str]] = {}
-    for file in by_path.values():
-        by_stem.setdefault(stem_of(file), []).append(file)
-    names = []
-    for image in images:
-        alike = by_stem.get(stem_of(image), [])
-        names.append(by_path.get(image.rpartition(".")[0]) or (alike[0] if len(alike) == 1 else ""))
-    return names
+    times = Counter(map(stem_of, by_path.values()))
+    only = {stem_of(file): file for file in by_path.values() if times[stem_of(file)] == 1}
+    return [by_path.get(image.rpartition(".")[0]) or only.get(stem_of(image), "") for image in images]
 
 
 def _class_names(source: Source, masks: UInt8[np.ndarray, "n s s"], files: list[str]) -> tuple[str, ...]:
@@ -220,7 +216,7 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
     if not len(with_depth):
         expected = "".join(map_names("depth")[:1])
         raise ValueError(f"{source.path} has no depth maps for its images (expected {expected})")
-    table = table.select(with_depth[evenly_spaced(len(with_depth), limit)])
+    table = table.select(with_depth).at_most(limit)
     missing = [name for name in (*LIGHT, *CAMERA) if name not in table.labels]
     if missing:
         raise ValueError(f"the params.csv in {source.path} lacks the column for {missing[0]!r}")

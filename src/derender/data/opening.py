@@ -1,14 +1,9 @@
-"""From what the user wrote to a stream of images; zip archives are read in place.
+"""From what the user wrote to a stream of images.
 
 A path may be followed by ``::PART``: a part of the official split or any folder. Streams (shards, and data
 sets of Hugging Face's library) are read from front to back. They take ``?column=NAME`` (also ``config``,
 ``revision``) before ``::PART``; others take ``?half=test`` or ``?half=development``. A path that exists is
 always a path.
-
-Members of a zip with absolute names or ``..`` in them, encrypted ones and those packed by bzip2 or LZMA are
-passed over and listed. Refused are another size or CRC-32 than in the directory, and a size beyond
-``FILE_LIMIT_BYTES``. So is a member that reaches into the next: members within each other let small archives
-unpack to endless ones.
 """
 
 import hashlib
@@ -16,102 +11,18 @@ import os
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from urllib.parse import parse_qsl
 
-import numpy as np
-from jaxtyping import Int64
-
-from derender.data.image import DECODER_ERRORS, HEAD_BYTES, LARGE_BYTES, Unreadable, refuse_by_header
 from derender.data.layouts import layout_named, recognise
 from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
-from derender.data.source import (
-    FILE_LIMIT_BYTES,
-    FileSource,
-    FolderSource,
-    Skipped,
-    Source,
-    evenly_spaced,
-    is_hidden,
-    is_image,
-)
+from derender.data.source import FileSource, FolderSource, Source, ZipSource, is_hidden, is_image
 from derender.data.stream import Sample, Stream
 from derender.data.streamed import SHARD_SUFFIXES, HuggingFaceStream, ShardStream, find_shards, is_saved
 from derender.storage.places import SUFFIXES, nearest_sibling, require_known
-
-_HEADER_BYTES = 30
-_ENCRYPTED = 1
-_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
-_UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
-
-
-class ZipSource(Source):
-    """The members of a zip that are neither hidden, unsafe, encrypted nor packed in a way of their own.
-
-    Of two with one name the later.
-    """
-
-    def __init__(self, path: Path):
-        self.path = path
-        try:
-            self._archive = zipfile.ZipFile(path)
-        except DECODER_ERRORS as problem:
-            raise ValueError(
-                f"{path} is damaged or not a whole zip file ({problem}); download or copy it again"
-            ) from problem
-        self._members: dict[str, zipfile.ZipInfo] = {}
-        faults: set[tuple[str, str]] = set()
-        for member in self._archive.infolist():
-            file = member.filename.replace("\\", "/")
-            if _HIDDEN.search(file):
-                continue
-            if _UNSAFE.search(file):
-                faults.add((file, "unsafe name in the zip (absolute or with ..)"))
-            elif member.flag_bits & _ENCRYPTED:
-                faults.add((file, "encrypted in the zip"))
-            elif member.compress_type not in _PACKINGS:
-                faults.add((file, "packed by bzip2, LZMA or the like: pack the zip by deflate, as usual"))
-            else:
-                self._members[file] = member
-        self.files = tuple(sorted(self._members))
-        self.skipped = tuple(Skipped(*fault) for fault in sorted(faults))
-        begins = sorted({member.header_offset for member in self._archive.infolist()})
-        self._following = dict(pairwise([*begins, self._archive.start_dir]))
-
-    def read(self, file: str) -> bytes:
-        member = self._members[file]
-        size = member.file_size
-        if size > FILE_LIMIT_BYTES:
-            raise ValueError(f"unpacks to {size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB")
-        end = member.header_offset + _HEADER_BYTES + len(member.orig_filename) + member.compress_size
-        try:
-            if end > self._following[member.header_offset]:
-                raise ValueError("it reaches into what comes after it")
-            with self._archive.open(member) as stream:
-                content = stream.read(min(size, HEAD_BYTES))
-                if size > LARGE_BYTES and is_image(file):
-                    refuse_by_header(content, size)
-                content += stream.read(size - len(content))  # without a number it would never end
-            if len(content) != size:
-                raise ValueError("it is shorter than the directory says")
-        except Unreadable:
-            raise
-        except DECODER_ERRORS as problem:
-            raise ValueError(f"cannot be unpacked: {problem}") from problem
-        return content
-
-    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
-        members = (self._members[file] for file in files)
-        return np.array([(one.file_size, one.CRC) for one in members], np.int64).reshape(-1, 2)
-
-    def close(self) -> None:
-        self._archive.close()
-
 
 STREAMED = ("webdataset", "huggingface")
 """The layouts that are read from front to back, by the names one can ask for them."""
@@ -164,12 +75,11 @@ def open_images(
         subset: the part, if it is not in ``source``.
         limit: at most so many images: evenly spaced where it is known what there is, else the first.
     """
-    place, part, options = parse_source(source)
+    place, part, options = parse_source(source, subset)
     path = Path(place).expanduser()
     kind = _kind_of(path, place) if dataset == "auto" else dataset
     if kind not in STREAMED:
         return list_images(source, dataset=dataset, subset=subset, limit=limit)
-    part = _only_part(source, part, subset)
     if kind == "webdataset":
         if set(options) - {"column"}:
             raise ValueError(f"{source}: shards take ?column=NAME only")
@@ -196,8 +106,7 @@ def list_images(
     No image at all is an error that says what is there instead. The arguments are those of ``open_images``.
     """
     layout = None if dataset == "auto" else layout_named(dataset)
-    place, part, options = parse_source(source)
-    subset = _only_part(source, part, subset)
+    place, subset, options = parse_source(source, subset)
     files = open_source(Path(place).expanduser())
     try:
         half = half_named(source, options)
@@ -208,9 +117,7 @@ def list_images(
     except BaseException:
         files.close()
         raise
-    if limit is not None and limit < len(table.files):
-        table = table.select(evenly_spaced(len(table.files), limit))
-    return ListedStream(files, layout, table, subset, half)
+    return ListedStream(files, layout, table.at_most(limit), subset, half)
 
 
 def half_named(source: str | Path, options: dict[str, str]) -> str:
@@ -237,8 +144,11 @@ def open_source(path: Path) -> Source:
     )
 
 
-def parse_source(source: str | Path) -> tuple[str, str | None, dict[str, str]]:
-    """Place, part and options of ``PLACE?column=NAME::PART``; a path that exists as written is all place."""
+def parse_source(source: str | Path, subset: str | None = None) -> tuple[str, str | None, dict[str, str]]:
+    """Place, part and options of ``PLACE?column=NAME::PART``; a path that exists as written is all place.
+
+    A part that was named separately is ``subset``; another one in ``source`` is a ValueError.
+    """
     if not isinstance(source, str | Path):
         raise TypeError(
             f"expected a folder, zip, shards or Hugging Face id, got {type(source).__name__}: "
@@ -246,25 +156,22 @@ def parse_source(source: str | Path) -> tuple[str, str | None, dict[str, str]]:
         )
     text = str(source)
     if Path(text).expanduser().exists():
-        return text, None, {}
+        return text, subset, {}
     left, separator, part = text.rpartition("::")
     if not separator:
         left, part = text, ""
     elif not left or not part:
         raise ValueError(f"{text} should read PATH::SUBSET, with both parts")
+    if part and subset not in (None, part):
+        raise ValueError(f"{source} names the part {part!r}, but subset={subset!r} was given too; give one")
+    part = part or subset
     place, _, query = left.partition("?")
     if not query or Path(left).expanduser().exists():
-        return left, part or None, {}
+        return left, part, {}
     options = dict(parse_qsl(query, keep_blank_values=True))
     for name in options:
         require_known(f"option of {text}", name, _OPTIONS)
-    return place, part or None, options
-
-
-def _only_part(source: str | Path, part: str | None, subset: str | None) -> str | None:
-    if part is not None and subset is not None and part != subset:
-        raise ValueError(f"{source} names the part {part!r}, but subset={subset!r} was given too; give one")
-    return subset if part is None else part
+    return place, part, options
 
 
 def _nothing_found(files: Source) -> str:

@@ -1,8 +1,13 @@
-"""Named files that are read by name: the interface of folders, zips, tables and single images; and folders.
+"""Named files that are read by name: the interface of folders, zips, tables and single images.
 
 Names are posix paths relative to the source, sorted. Nothing is ever extracted, so that no name in an archive
 can write anywhere. A folder is walked once: hidden files and ``__MACOSX`` are left out, and links are
 followed, each real folder once, so that loops end.
+
+Members of a zip with absolute names or ``..`` in them, encrypted ones and those packed by bzip2 or LZMA are
+passed over and listed. Refused are another size or CRC-32 than in the directory, and a size beyond
+``FILE_LIMIT_BYTES``. So is a member that reaches into the next: members within each other let small archives
+unpack to endless ones.
 
 A parquet file is opened only if what its footer claims can be: readers reserve memory for as many rows as it
 names. Leaves out the pages behind the footer and the columns of single row groups: of a damaged footer
@@ -10,23 +15,31 @@ pyarrow 26 looks at those with C++ exceptions that end the process.
 """
 
 import os
+import re
 import stat
+import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
+from posixpath import basename, dirname
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Int64
 
-from derender.storage.bounded import read_bounded
+from derender.data.image import DECODER_ERRORS, HEAD_BYTES, LARGE_BYTES, Unreadable, refuse_by_header
+from derender.storage.bounded import FILE_LIMIT_BYTES, read_bounded
 from derender.storage.places import SUFFIXES
 
-FILE_LIMIT_BYTES = 512 << 20
-"""No single file larger than this is read: a bound on memory, and on what a zip bomb can unpack to."""
+_HEADER_BYTES = 30
+_ENCRYPTED = 1
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
+_UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,10 @@ class Source(Closing, ABC):
         """The files with an image's suffix."""
         return tuple(file for file in self.files if is_image(file))
 
+    def images_in(self, folder: str) -> list[str]:
+        """The images in folders of that name."""
+        return [file for file in self.images if parent_name(file) == folder]
+
     @cached_property
     def _by_name(self) -> dict[str, str]:
         others = [file for file in self.files if not is_image(file)]  # of images there may be millions
@@ -101,12 +118,13 @@ class FileSource(Source):
     """Files beside one another on disk; a single image is the usual case."""
 
     def __init__(self, path: Path):
-        self.path = path
+        self.path, self._folder = path, path.parent
         self.files = (printable(path.name),)
+        self._on_disk = {self.files[0]: path.name}  # the name that a file has on disk, where that differs
 
     def on_disk(self, file: str) -> Path:
         """Where a file lies."""
-        return self.path
+        return self._folder / self._on_disk.get(file, file)
 
     def read(self, file: str) -> bytes:
         return read_bounded(self.on_disk(file), FILE_LIMIT_BYTES)
@@ -119,8 +137,8 @@ class FolderSource(FileSource):
     """Every file below a folder."""
 
     def __init__(self, path: Path):
-        self.path = path
-        self._found: dict[str, str] = {}  # each file's path by its printable path
+        self.path = self._folder = path
+        self._on_disk = {}
         faults: dict[str, str] = {}  # what is no file, and why
         seen: set[tuple[int, int]] = set()
 
@@ -131,10 +149,9 @@ class FolderSource(FileSource):
         for folder, below, names in os.walk(path, onerror=unlisted, followlinks=True):
             here, status = Path(folder).relative_to(path).as_posix(), Path(folder).stat()
             entries = [name for name in names if not is_hidden(name)]
-            if here != "." and {"config.yaml", "environment.json"}.issubset(entries):
+            if is_run := here != "." and {"config.yaml", "environment.json"}.issubset(entries):
                 faults[here] = "a run folder: its sheets are no images to read"
-                entries, below[:] = [], []
-            elif (status.st_dev, status.st_ino) in seen:
+            if is_run or (status.st_dev, status.st_ino) in seen:
                 entries, below[:] = [], []
             seen.add((status.st_dev, status.st_ino))
             below[:] = sorted(name for name in below if not is_hidden(name))
@@ -142,16 +159,76 @@ class FolderSource(FileSource):
                 name = entry if here == "." else f"{here}/{entry}"
                 try:
                     if stat.S_ISREG(os.stat(f"{path}/{name}").st_mode):  # noqa: PTH116  (a million times)
-                        self._found[printable(name)] = name
+                        self._on_disk[printable(name)] = name
                     else:
                         faults[name] = "not a regular file"
                 except OSError as problem:
                     faults[name] = f"broken link or unreachable file: {problem.strerror}"
-        self.files = tuple(sorted(self._found))
+        self.files = tuple(sorted(self._on_disk))
         self.skipped = tuple(Skipped(printable(name), faults[name]) for name in sorted(faults))
 
-    def on_disk(self, file: str) -> Path:
-        return self.path / self._found[file]
+
+class ZipSource(Source):
+    """The members of a zip that are neither hidden, unsafe, encrypted nor packed in a way of their own.
+
+    Of two with one name the later.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            self._archive = zipfile.ZipFile(path)
+        except DECODER_ERRORS as problem:
+            raise ValueError(
+                f"{path} is damaged or not a whole zip file ({problem}); download or copy it again"
+            ) from problem
+        self._members: dict[str, zipfile.ZipInfo] = {}
+        faults: set[tuple[str, str]] = set()
+        for member in self._archive.infolist():
+            file = member.filename.replace("\\", "/")
+            if _HIDDEN.search(file):
+                continue
+            if _UNSAFE.search(file):
+                faults.add((file, "unsafe name in the zip (absolute or with ..)"))
+            elif member.flag_bits & _ENCRYPTED:
+                faults.add((file, "encrypted in the zip"))
+            elif member.compress_type not in _PACKINGS:
+                faults.add((file, "packed by bzip2, LZMA or the like: pack the zip by deflate, as usual"))
+            else:
+                self._members[file] = member
+        self.files = tuple(sorted(self._members))
+        self.skipped = tuple(Skipped(*fault) for fault in sorted(faults))
+        begins = sorted({member.header_offset for member in self._archive.infolist()})
+        self._following = dict(pairwise([*begins, self._archive.start_dir]))
+
+    def read(self, file: str) -> bytes:
+        member = self._members[file]
+        size = member.file_size
+        if size > FILE_LIMIT_BYTES:
+            raise ValueError(f"unpacks to {size >> 20:,} MiB, more than {FILE_LIMIT_BYTES >> 20:,} MiB")
+        end = member.header_offset + _HEADER_BYTES + len(member.orig_filename) + member.compress_size
+        try:
+            if end > self._following[member.header_offset]:
+                raise ValueError("it reaches into what comes after it")
+            with self._archive.open(member) as stream:
+                content = stream.read(min(size, HEAD_BYTES))
+                if size > LARGE_BYTES and is_image(file):
+                    refuse_by_header(content, size)
+                content += stream.read(size - len(content))  # without a number it would never end
+            if len(content) != size:
+                raise ValueError("it is shorter than the directory says")
+        except Unreadable:
+            raise
+        except DECODER_ERRORS as problem:
+            raise ValueError(f"cannot be unpacked: {problem}") from problem
+        return content
+
+    def stamps(self, files: Sequence[str]) -> Int64[np.ndarray, "n 2"]:
+        members = (self._members[file] for file in files)
+        return np.array([(one.file_size, one.CRC) for one in members], np.int64).reshape(-1, 2)
+
+    def close(self) -> None:
+        self._archive.close()
 
 
 def stamps_of(paths: Iterable[Path]) -> Int64[np.ndarray, "n 2"]:
@@ -168,6 +245,16 @@ def evenly_spaced(count: int, limit: int | None) -> Int64[np.ndarray, " k"]:
 def is_image(file: str) -> bool:
     """Whether the name has an image's suffix."""
     return file.lower().endswith(SUFFIXES)
+
+
+def stem_of(file: str) -> str:
+    """A file's name without its folders and its suffix."""
+    return basename(file).rsplit(".", 1)[0]
+
+
+def parent_name(file: str) -> str:
+    """The name of the folder that a file lies in, "" at the top."""
+    return basename(dirname(file))
 
 
 def is_hidden(name: str) -> bool:

@@ -12,7 +12,6 @@ optional: ``pip install 'derender[huggingface]'``. Tested are folders in the for
 sets, not the Hub itself.
 """
 
-import importlib
 import json
 import lzma
 import os
@@ -26,10 +25,10 @@ from itertools import accumulate, islice, product
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from derender.data.layouts.layout import PARTITION_NAMES
-from derender.data.source import FILE_LIMIT_BYTES, is_hidden, is_image, printable, stamps_of
+from derender.data.layouts.layout import partition_named
+from derender.data.source import is_hidden, is_image, printable, stamps_of
 from derender.data.stream import Sample, Stream, Value, label_name, unreadable
-from derender.storage.bounded import read_bounded
+from derender.storage.bounded import FILE_LIMIT_BYTES, read_bounded
 from derender.storage.places import optional, suggestion
 
 SHARD_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
@@ -131,7 +130,7 @@ class ShardStream(Stream):
         if not images and not fault:
             missing = "no image" if self.column is None else f"no {self.column!r}"
             fault = f"{missing} in this sample (it has {', '.join(group.content)})"
-        partition = next(filter(None, (PARTITION_NAMES.get(one.lower()) for one in _series(shard))), "")
+        partition = partition_named(_series(shard))
         if fault:
             return Sample(name, unreadable(fault), share, partition=partition)
         read, labels = partial(bytes, group.content[images[0]] or b""), {}
@@ -259,11 +258,10 @@ class HuggingFaceStream(Stream):
         return super().place if isinstance(self._where, Path) else f"{self._where} {self._options}"
 
     def samples(self, start: int = 0) -> Iterator[Sample]:
-        known = [count for count in self._counts.values() if count is not None]
-        total = sum(known) if len(known) == len(self._counts) else 0
+        total = sum(self._counts.values()) if all(self._counts.values()) else 0
         before = 0
         for name, rows in self._splits.items():
-            first = min(self._counts[name] or 0, max(0, start - before))
+            first = min(self._counts[name], max(0, start - before))
             row = first - 1
             for row, values in enumerate(rows.skip(first) if first else rows, first):
                 if before + row >= start:
@@ -286,7 +284,7 @@ class HuggingFaceStream(Stream):
             if names is not None and value is not None:
                 value = names[value] if 0 <= value < len(names) else None
             labels[label_name(column)] = value
-        return Sample(name, read, share, labels, PARTITION_NAMES.get(split.lower(), ""))
+        return Sample(name, read, share, labels, partition_named([split]))
 
 
 def _commit(identifier: str, revision: str | None) -> str:
@@ -308,9 +306,9 @@ def _commit(identifier: str, revision: str | None) -> str:
         raise ValueError(fault) from problem
 
 
-def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[str, Any]:
+def _load(source: str, place: str | Path, config: str | None, revision: str | None) -> dict[Any, Any]:
     """Every split as a data set that has read nothing yet."""
-    datasets: Any = importlib.import_module("datasets")
+    import datasets.exceptions
 
     try:
         if isinstance(place, Path) and is_saved(place):
@@ -350,10 +348,10 @@ def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str,
     return column or images[0], labels
 
 
-def _count(rows: Any) -> int | None:
-    """The number of rows, where it is known without reading them."""
+def _count(rows: Any) -> int:
+    """The number of rows, 0 where it is not known without reading them."""
     known = (rows.info.splits or {}).get(str(rows.split))
-    return getattr(rows, "num_rows", None) or getattr(known, "num_examples", None) or None
+    return getattr(rows, "num_rows", None) or getattr(known, "num_examples", None) or 0
 
 
 def _read_path(path: str, place: str | Path) -> bytes:

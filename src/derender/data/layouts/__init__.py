@@ -7,25 +7,15 @@ or test (and the like) is read as a partition, not as a class.
 from posixpath import basename
 
 from derender.data.layouts import faces, rendered, tables
-from derender.data.layouts.layout import (
-    PARTITION_NAMES,
-    TOLD,
-    Layout,
-    Table,
-    mostly,
-    parent_name,
-    partition_by_folder,
-    partition_column,
-    text_column,
-)
-from derender.data.source import Source
+from derender.data.layouts.layout import TOLD, Layout, Table, mostly, partition_named, partitions, text_column
+from derender.data.source import Source, parent_name
 from derender.storage.places import require_known
 
 
 def _class(file: str) -> str:
     """The name of the folder that a file lies in, unless that is a partition's."""
     name = parent_name(file)
-    return "" if name.lower() in PARTITION_NAMES else name
+    return "" if partition_named([name]) else name
 
 
 def _is_classes(source: Source) -> bool:
@@ -36,7 +26,7 @@ def _is_classes(source: Source) -> bool:
 
 
 def _load_folder(source: Source) -> Table:
-    return Table(source.images, partition=partition_column(map(partition_by_folder, source.images)))
+    return Table(source.images, partition=partitions(source.images))
 
 
 def _load_classes(source: Source) -> Table:
@@ -53,9 +43,9 @@ _READERS = {  # by name: whether a source looks like the layout, and the table o
     "rafdb": (lambda source: faces.raf_list(source) is not None, faces.load_rafdb),
     "celebamask": (faces.is_celebamask, faces.load_celebamask),
     "celeba": (faces.is_celeba, faces.load_celeba),
-    "utkface": (lambda source: mostly(faces.UTK_NAME, map(basename, source.images)), faces.load_utkface),
-    "yaleb": (lambda source: mostly(faces.YALE_NAME, map(basename, source.images)), faces.load_yale),
-    "lfw": (lambda source: mostly(faces.LFW_NAME, source.images), faces.load_lfw),
+    "utkface": (lambda source: mostly(faces.UTK_NAME.match, map(basename, source.images)), faces.load_utk),
+    "yaleb": (lambda source: mostly(faces.YALE_NAME.match, map(basename, source.images)), faces.load_yale),
+    "lfw": (lambda source: mostly(faces.LFW_NAME.match, source.images), faces.load_lfw),
     "shapenet_cars": (rendered.is_cars, rendered.load_cars),
     "face_tracks": (faces.is_tracks, faces.load_tracks),
     "classes": (_is_classes, _load_classes),

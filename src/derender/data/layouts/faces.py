@@ -22,21 +22,18 @@ import numpy as np
 from jaxtyping import Float32
 
 from derender.data.layouts.layout import (
-    MOSTLY,
     PARTITION_NAMES,
     TOLD,
     Labels,
     Table,
     header_of,
-    number_column,
-    parent_name,
+    mostly,
     read_csv,
     read_list,
-    stem_of,
     text_column,
 )
 from derender.data.layouts.rendered import track_labels
-from derender.data.source import Source
+from derender.data.source import Source, parent_name, stem_of
 
 # In a few published names the race is missing, in one the gender.
 UTK_NAME = re.compile(r"(?P<age>\d{1,3})_(?P<gender>\d?)_(?:(?P<race>\d)_)?\d{8,}")
@@ -58,13 +55,13 @@ _NUMBERED = re.compile(
 _NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
 
-def load_utkface(source: Source) -> Table | None:
+def load_utk(source: Source) -> Table | None:
     """Age, gender and race from the names; values outside the published codes count as unknown."""
     results = [UTK_NAME.match(basename(file)) for file in source.images]
     if source.images and not any(results):
         return None
     ages = [float(one["age"]) if one else np.nan for one in results]
-    labels = {"age": number_column(age if age <= _UTK_OLDEST else np.nan for age in ages)}
+    labels = {"age": np.array([age if age <= _UTK_OLDEST else np.nan for age in ages], np.float32)}
     for column, names in _UTK_CODES.items():
         by_code = dict(zip("01234", names, strict=False))
         labels[column] = text_column(by_code.get(one[column] or "", "") if one else "" for one in results)
@@ -77,9 +74,9 @@ def load_yale(source: Source) -> Table:
     azimuth, elevation = (np.array([float(one[name]) for one in result.values()]) for name in ("a", "e"))
     cosine = np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation))
     labels = {name: text_column(one[name] for one in result.values()) for name in ("identity", "pose")}
-    labels |= {"light_azimuth_deg": number_column(azimuth), "light_elevation_deg": number_column(elevation)}
-    labels["light_deg"] = number_column(np.degrees(np.arccos(cosine)).round(3))
-    return Table(tuple(result), labels)
+    light = {"light_azimuth_deg": azimuth, "light_elevation_deg": elevation}
+    light["light_deg"] = np.degrees(np.arccos(cosine)).round(3)
+    return Table(tuple(result), labels | {name: one.astype(np.float32) for name, one in light.items()})
 
 
 def load_lfw(source: Source) -> Table | None:
@@ -337,36 +334,29 @@ def parts_of(source: Source) -> dict[str, dict[int, str]]:
     return result
 
 
-def _mask_images(source: Source) -> tuple[str, ...]:
-    published = tuple(file for file in source.images if parent_name(file) == "CelebA-HQ-img")
-    return published or tuple(file for file in source.images if parent_name(file) == "images")
-
-
-def _mask_names(source: Source, images: Sequence[str]) -> list[str]:
-    """The mask of each image, "" where there is none: a file, or FOLDER/NUMBER_*.png for one in parts."""
+def _mask_names(source: Source) -> dict[str, str]:
+    """By image its mask, "" where there is none: a file, or FOLDER/NUMBER_*.png for one in parts."""
     merged = {file for file in source.files if file.endswith(".png") and parent_name(file) == "masks"}
     in_parts = {int(basename(name).removesuffix("_*.png")): name for name in parts_of(source)}
-    names = []
-    for file in images:
+    names = {}
+    for file in source.images_in("CelebA-HQ-img") or source.images_in("images"):
         stem, folders = stem_of(file), file.split("/")[:-2]
         number = int(stem) if stem.isdecimal() and stem.isascii() else -1
         beside = "/".join([*folders, "masks", f"{stem}.png"])
-        names.append(beside if beside in merged else in_parts.get(number, ""))
+        names[file] = beside if beside in merged else in_parts.get(number, "")
     return names
 
 
 def is_celebamask(source: Source) -> bool:
-    files = _mask_images(source)
-    return bool(files) and sum(map(bool, _mask_names(source, files))) >= MOSTLY * len(files)
+    return mostly(bool, _mask_names(source).values())
 
 
 def load_celebamask(source: Source) -> Table | None:
     """The label ``mask`` names each mask ("" for none); attributes and parts where their lists are there."""
-    files = _mask_images(source)
-    masks = _mask_names(source, files)
-    if not any(masks):
+    masks = _mask_names(source)
+    if not any(masks.values()):
         return None
-    names = [basename(file) for file in files]
+    names = [basename(file) for file in masks]
     labels, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
     if (mapping := source.named(_MAPPING)) is not None:
         expected, header = "idx orig_idx orig_file, as in 0 119613 119614.jpg", r"idx\s+orig_idx\s+orig_file"
@@ -374,4 +364,4 @@ def load_celebamask(source: Source) -> Table | None:
         origins = {f"{int(number)}.jpg": int(origin) for _, (number, origin) in rows}
         numbers = [origins.get(name, 0) for name in names]
         partition = _IN_ORDER[np.searchsorted(_FIRST_NUMBERS, numbers, "right")]
-    return Table(files, {"mask": text_column(masks), **labels}, partition)
+    return Table(tuple(masks), {"mask": text_column(masks.values()), **labels}, partition)

@@ -11,14 +11,13 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from posixpath import basename, dirname
 from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 from jaxtyping import Float32
 
-from derender.data.source import Skipped, Source
+from derender.data.source import Skipped, Source, evenly_spaced, stem_of
 from derender.storage.places import require_known
 
 Labels = dict[str, np.ndarray]
@@ -33,7 +32,7 @@ PARTITION_NAMES = {
 TOLD = yaml.safe_load(Path(__file__).with_name("layouts.yaml").read_text(encoding="utf-8"))
 """What is told of each layout, by its name."""
 
-MOSTLY = 0.9
+_MOSTLY = 0.9
 """Share of the images that must look right for a layout to be recognised: real sets hold a few odd names."""
 
 
@@ -60,6 +59,10 @@ class Table:
             self.skipped,
         )
 
+    def at_most(self, limit: int | None) -> "Table":
+        """The same table with at most so many rows, evenly spaced."""
+        return self.select(evenly_spaced(len(self.files), limit))
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -78,9 +81,7 @@ class Layout:
     default_parts: Sequence[str] = ()
     fit: str = "crop"  # what becomes of images that are not square (data/image.py)
 
-    def read(
-        self, source: Source, subset: str | None = None, default_parts: Sequence[str] | None = None
-    ) -> Table:
+    def read(self, source: Source, subset: str | None = None) -> Table:
         """The images of one part: of the official split, else those in a folder of that name at any depth."""
         table = self.load(source)
         if table is None:
@@ -91,9 +92,8 @@ class Layout:
             )
         known = set() if table.partition is None else {*table.partition.tolist()}
         parts = sorted(known - {""})
-        defaults = self.default_parts if default_parts is None else default_parts
-        if subset is None and defaults and len(known) > 1:
-            subset = next((part for part in defaults if part in known), None)
+        if subset is None and self.default_parts and len(known) > 1:
+            subset = next((part for part in self.default_parts if part in known), None)
             if subset is None:
                 raise ValueError(f"{source.path}: name one of its parts; there are {', '.join(parts)}")
         if subset is None:
@@ -146,26 +146,20 @@ def in_test_half(name: str) -> bool:
     return hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[0] % 2 == 1
 
 
-def stem_of(file: str) -> str:
-    """A file's name without its folders and its suffix."""
-    return basename(file).rsplit(".", 1)[0]
+def mostly(fits: Callable[[str], object], names: Iterable[str]) -> bool:
+    """Whether nearly all of the names, and at least one, fit."""
+    results = [bool(fits(name)) for name in names]
+    return bool(results) and sum(results) >= _MOSTLY * len(results)
 
 
-def parent_name(file: str) -> str:
-    """The name of the folder that a file lies in, "" at the top."""
-    return basename(dirname(file))
+def partition_named(names: Iterable[str]) -> str:
+    """The partition that the first name of one stands for, or ""."""
+    return next((PARTITION_NAMES[name.lower()] for name in names if name.lower() in PARTITION_NAMES), "")
 
 
-def mostly(pattern: re.Pattern[str], names: Iterable[str]) -> bool:
-    """Whether nearly all of the names, and at least one, begin with the pattern."""
-    matches = [pattern.match(name) is not None for name in names]
-    return bool(matches) and sum(matches) >= MOSTLY * len(matches)
-
-
-def partition_by_folder(file: str) -> str:
-    """The partition that the outermost folder of such a name stands for, or ""."""
-    folders = (folder.lower() for folder in file.split("/")[:-1])
-    return next((PARTITION_NAMES[folder] for folder in folders if folder in PARTITION_NAMES), "")
+def partitions(files: Iterable[str]) -> np.ndarray | None:
+    """The partition of each file by its outermost folder of such a name, or None where all are unknown."""
+    return partition_column(partition_named(file.split("/")[:-1]) for file in files)
 
 
 def partition_column(values: Iterable[str]) -> np.ndarray | None:
@@ -186,10 +180,6 @@ def missing(labels: np.ndarray) -> np.ndarray:
 
 def text_column(values: Iterable[str]) -> np.ndarray:
     return np.array(list(values), dtype=np.str_)
-
-
-def number_column(values: Iterable[float]) -> np.ndarray:
-    return np.array(list(values), dtype=np.float32)
 
 
 def read_csv(source: Source, file: str, required: Sequence[str] = ()) -> list[Mapping[str, str]]:

@@ -18,20 +18,17 @@ import yaml
 
 from derender.data.image import DECODER_ERRORS, upright_size
 from derender.data.layouts.layout import (
-    MOSTLY,
-    PARTITION_NAMES,
     Labels,
     Table,
     header_of,
-    number_column,
-    parent_name,
-    partition_by_folder,
+    mostly,
     partition_column,
+    partition_named,
+    partitions,
     read_csv,
-    stem_of,
     text_column,
 )
-from derender.data.source import Source
+from derender.data.source import Source, parent_name, stem_of
 
 LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
@@ -54,14 +51,14 @@ def rendered_folders(source: Source) -> list[str]:
     """The folders (with a final slash, or "") that hold a params.csv and images beside it."""
     if source.named("params.csv") is None:
         return []
-    depicted = {file.rpartition("/")[0].removesuffix("images") for file in _images_in(source, "images")}
+    depicted = {file.rpartition("/")[0].removesuffix("images") for file in source.images_in("images")}
     tables = (file for file in source.files if f"/{file}".endswith("/params.csv"))
     return [folder for table in tables if (folder := table.removesuffix("params.csv")) in depicted]
 
 
 def pairs_of(source: Source) -> dict[str, str]:
     """Image to depth map, for every image in a folder ``image`` with a map in the folder beside it."""
-    images = _images_in(source, "image")
+    images = source.images_in("image")
     known, result = set(source.files) if images else set(), {}
     for file in images:
         stem, folder = stem_of(file), file.rpartition("/")[0].removesuffix("image")
@@ -81,11 +78,6 @@ def track_labels(files: Sequence[str], pattern: re.Pattern[str]) -> Labels | Non
         "track": text_column(f"{match['identity']}/{match['track']}" for match in matches),
         "frame": text_column(map(stem_of, files)),
     }
-
-
-def _images_in(source: Source, folder: str) -> list[str]:
-    """The images in folders of that name."""
-    return [file for file in source.images if parent_name(file) == folder]
 
 
 def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) -> Labels:
@@ -109,7 +101,7 @@ def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) ->
                     f"params.csv in {source.path}: column {name!r} holds something that is no number "
                     f"({problem})"
                 ) from problem
-            labels[label] = number_column(values * (math.pi / 180 if name in _DEGREES else 1.0))
+            labels[label] = (values * (math.pi / 180 if name in _DEGREES else 1)).astype(np.float32)
     return labels
 
 
@@ -149,15 +141,15 @@ def load_tracks(source: Source) -> Table | None:
 
 def is_paired(source: Source) -> bool:
     """Every image in a folder ``image`` has its depth map, and there is at least one."""
-    images = _images_in(source, "image")
+    images = source.images_in("image")
     return bool(images) and len(pairs_of(source)) == len(images)
 
 
 def load_pairs(source: Source) -> Table:
     """The images without their maps, with the owners' split where the folders give one."""
     files = tuple(pairs_of(source))
-    around = (parent_name(file.rpartition("/")[0]).lower() for file in files)
-    return Table(files, partition=partition_column(PARTITION_NAMES.get(name, "") for name in around))
+    around = (file.split("/")[-3:-2] for file in files)
+    return Table(files, partition=partition_column(map(partition_named, around)))
 
 
 def _table_of(source: Source) -> str | None:
@@ -167,15 +159,14 @@ def _table_of(source: Source) -> str | None:
 
 
 def is_cars(source: Source) -> bool:
-    files = source.images
-    ours = _table_of(source) is not None or any(_CARS in file.split("/") for file in files[:1])
-    return ours and bool(files) and sum(1 for file in files if _ID.search(file)) >= MOSTLY * len(files)
+    ours = _table_of(source) is not None or any(_CARS in file.split("/") for file in source.images[:1])
+    return ours and mostly(_ID.search, source.images)
 
 
 def load_cars(source: Source) -> Table | None:
     files = tuple(file for file in source.images if not _MAPS & set(file.split("/")[:-1]))
     models = [results[0] if (results := _ID.search(file)) else "" for file in files]
-    partition = partition_column(map(partition_by_folder, files))
+    partition = partitions(files)
     if not any(models) and partition is None:
         return None
     labels: Labels = {"model": text_column(models)} if any(models) else {}

@@ -15,15 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from derender.data.layouts.layout import (
-    PARTITION_NAMES,
-    Table,
-    header_of,
-    number_column,
-    read_csv,
-    stem_of,
-    text_column,
-)
+from derender.data.layouts.layout import PARTITION_NAMES, Table, header_of, read_csv, text_column
 from derender.data.source import FileSource, Skipped, Source, is_image, opened_parquet
 
 TABLE_SUFFIXES = (".csv", ".parquet")
@@ -44,9 +36,6 @@ class TableSource(FileSource):
         there = (file for file in paths if is_image(file))
         there = [file for file in there if os.path.isfile(self.on_disk(file))]  # noqa: PTH113  (or too long)
         self.files = tuple(sorted({self.table, *there}))
-
-    def on_disk(self, file: str) -> Path:
-        return self.path.parent / file
 
 
 def holds_paths(path: Path) -> bool:
@@ -74,7 +63,7 @@ def is_listed(source: Source) -> bool:
         names = ";".join(_cells(source, file)).lower()  # which other signs than commas may part
         return not {*PATH_COLUMNS}.isdisjoint(re.split("[;\t]", names))
     except ValueError:
-        return stem_of(file) == "data"
+        return PurePosixPath(file).stem == "data"
 
 
 def load_listed(source: Source) -> Table | None:
@@ -107,7 +96,7 @@ def label_column(values: Sequence[str]) -> np.ndarray:
     if known and known <= {*_YES, *_NO}:
         return np.array([1 if cell in _YES else 0 if cell in _NO else -1 for cell in cells], np.int8)
     if known and all(map(_is_number, known)):
-        return number_column(float(cell or "nan") for cell in cells)
+        return np.array([float(cell or "nan") for cell in cells], np.float32)
     return text_column(value.strip() for value in values)
 
 
