@@ -87,7 +87,7 @@ def _read_value(text: str) -> Any:
     return value
 
 
-def _full_key(key: str, tree: Mapping[str, Any], names: Iterable[str]) -> str:
+def _full_key(key: str, tree: Mapping[str, Any], names: Mapping[str, Any]) -> str:
     """The dotted name that a key stands for."""
     with suppress(LookupError, TypeError):
         reduce(getitem, key.split("."), tree)
@@ -97,7 +97,6 @@ def _full_key(key: str, tree: Mapping[str, Any], names: Iterable[str]) -> str:
         return ending[0]
     if ending:
         raise ValueError(f"{key!r} could mean {' or '.join(ending)}: write it in full")
-    names = list(names)
     guess = suggestion(key, names) or suggestion(
         key.rsplit(".", 1)[-1], [name.rsplit(".", 1)[-1] for name in names]
     )

@@ -35,9 +35,7 @@ _ENTRIES_LOOKED_AT = 10_000
 class ListedStream(Stream):
     """The images of ``files``, a folder, zip or table, in the order of its layout; it closes them."""
 
-    def __init__(
-        self, files: Source, layout: Layout, table: Table, subset: str | None = None, half: str = "all"
-    ):
+    def __init__(self, files: Source, layout: Layout, table: Table, subset: str | None, half: str):
         self.files = files
         self.layout, self.terms, self.fit = layout.name, layout.terms, layout.fit
         self.table: Table = table  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -151,9 +151,7 @@ def decoded(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def decode_samples(
-    start: int, samples: Iterable[Sample], image_size: int, fit: str = "crop"
-) -> list[Decoded]:
+def decode_samples(start: int, samples: Iterable[Sample], image_size: int, fit: str) -> list[Decoded]:
     """Decode consecutive samples, the first of them number ``start``, in this thread."""
     result = []
     for number, sample in enumerate(samples, start):

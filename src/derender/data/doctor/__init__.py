@@ -272,7 +272,7 @@ def doctor(
     values |= {} if shared is None else shared.values
     findings = findings_of(values, details, None if shared is None else shared.axis)
     result = verdict_of(findings), findings, values, group, identical, originals, shared
-    return Examination(images, *result, _examples(pixels, group, shared))
+    return Examination(images, *result, _examples(pixels.blank, group, shared))
 
 
 def quick_verdict(images: ImageSet) -> str:
@@ -314,17 +314,15 @@ def _compare(images: ImageSet, rows: np.ndarray, generator: np.random.Generator)
     return Shared(rows, values, measures.symmetry_axis(grey), orders)
 
 
-def _examples(
-    pixels: measures.Pixels, group: np.ndarray, shared: Shared | None
-) -> dict[str, tuple[int, ...]]:
+def _examples(blank: np.ndarray, group: np.ndarray, shared: Shared | None) -> dict[str, tuple[int, ...]]:
     """Images for the page, by what they show; those of the extremes are extreme, no pick."""
     examples: dict[str, np.ndarray] = {}
     copies = np.flatnonzero(group != np.arange(len(group)))
     if len(copies):
         some = copies[evenly_spaced(len(copies), SHOWN // 2)]
         examples["copies, in pairs"] = np.stack([group[some], some], axis=1).ravel()
-    if pixels.blank.any():
-        examples["empty"] = np.flatnonzero(pixels.blank)
+    if blank.any():
+        examples["empty"] = np.flatnonzero(blank)
     if shared is None:
         examples["all distinct"] = np.unique(group)
     elif shared.values["agreement"].value < (CHECKS["agreement"].objects or 0):
