@@ -31,34 +31,9 @@ class Lighting(NamedTuple):
     lamps: ndarray  # (L, 4) float32: strength, unit direction in which the light goes
     gloss: ndarray  # (2,) float32: strength and exponent
     haze: ndarray  # (2,) float32: beta, airlight
-    across: ndarray  # (L, 2, 3) float32: axes of the shadow maps, per scene unit
-    centre: ndarray  # (3,) float32: what the maps are drawn about
+    across: ndarray  # (L, 2, 3) float32: axes of the shadow maps, per scene unit; drawing fills them
+    centre: ndarray  # (3,) float32: what the maps are drawn about; filled as well
     maps: ndarray  # (L, R, R) float32: how near to the lamp the nearest surface is; (0, 0, 0) for no shadows
-
-
-def lighting(
-    ambient: np.float32, lamps: Float[ndarray, "lamps 4"], gloss: ndarray, haze: ndarray, shadows_px: int
-) -> Lighting:
-    """Light with room for shadow maps of an image so many pixels wide (0: none), which drawing fills."""
-    room = (len(lamps), TEXELS * shadows_px, TEXELS * shadows_px) if shadows_px else (0, 0, 0)
-    empty = (np.zeros(shape, np.float32) for shape in ((len(lamps), 2, 3), (3,), room))
-    return Lighting(ambient, lamps.astype(np.float32), gloss, haze, *empty)
-
-
-@kernel
-def is_plain(lighting):
-    more = len(lighting.lamps) > 1 or len(lighting.maps) > 0
-    return not (more or lighting.gloss[0] > _ZERO or lighting.haze[0] > _ZERO)
-
-
-@kernel
-def depths_seen(nearest):
-    """The least and the greatest depth in a buffer of 1 / z; equal where it is empty."""
-    near, far = _ZERO, np.float32(np.inf)
-    for w in nearest.flat:
-        if w > _ZERO:
-            near, far = max(near, w), min(far, w)
-    return (_ONE / near, _ONE / far) if near > _ZERO else (_ONE, _ONE)
 
 
 @kernel

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int32
 from numpy import ndarray
 
 from derender.data.synthetic.decals import NO_PAINT, SAMPLES, Paint, paint_samples
-from derender.data.synthetic.lighting import Lighting, axes_about, depths_seen, is_plain, light_at
+from derender.data.synthetic.lighting import Lighting, axes_about, light_at
 from derender.render.numba_threads import kernel
 
 _ALL = SAMPLES * SAMPLES
@@ -81,7 +81,10 @@ def draw_mesh(
     owner = np.full(nearest.shape, -1, np.int32)
     number = mesh.number if mesh.values.shape[1] == 2 else mesh.number[:0]
     fill_triangles(places, mesh.triangles, number, more, mesh.paint.holes, nearest, owner)
-    _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out)
+    span = (_ONE, _ONE)  # least and greatest depth that are seen, for haze
+    if light.haze[0] > _ZERO and (seen := nearest[nearest > _ZERO]).size:
+        span = (_ONE / seen.max(), _ONE / seen.min())
+    _shade_samples(mesh, places, more, owner, light, background, focal_px, span, out)
 
 
 def _place(
@@ -222,17 +225,19 @@ def _blend_three(more, k, at):
 
 
 @kernel
-def _shade_samples(mesh, places, more, owner, light, background, focal_px, nearest, out):
+def _shade_samples(mesh, places, more, owner, light, background, focal_px, span, out):
     painted, side = mesh.values.shape[1] == 2, len(background)
     surface = np.empty(_ALL, np.int32)  # of each sample, -1 on the background
     spot = np.zeros((2, _ALL), np.float32)  # place on the chart
     inside = np.empty(_ALL, np.bool_)
     colour = np.empty((_ALL, 3), np.float32)
     part, total = np.empty(_ALL, np.int32), np.empty(3, np.float32)
-    plain, lamp, result, air = is_plain(light), light.lamps[0], np.ones(4, np.float32), light.haze[1]
+    plain = len(light.lamps) == 1 and len(light.maps) == 0
+    plain = plain and light.gloss[0] == _ZERO and light.haze[0] == _ZERO
+    lamp, result, air = light.lamps[0], np.ones(4, np.float32), light.haze[1]
     result[2] = _ZERO
     depth, cosine, normal = _ONE, _ZERO, (_ZERO, _ZERO, _ZERO)
-    span, veil = depths_seen(nearest), np.exp(-light.haze[0])  # of what is farthest, and of the background
+    veil = np.exp(-light.haze[0])  # of what is farthest, and of the background
     for pixel in range(np.uint32(side * side)):
         i, j, seen = pixel // side, pixel % side, 0
         for s in range(np.uint32(_ALL)):

@@ -16,7 +16,7 @@ import yaml
 from numpy import ndarray
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from derender.data.synthetic.lighting import Lighting, lighting
+from derender.data.synthetic.lighting import TEXELS, Lighting
 from derender.overrides import with_changes
 from derender.settings import Settings
 from derender.storage.places import require_known
@@ -196,8 +196,10 @@ class EffectSettings(Settings):
         angles = np.rad2deg(np.stack([pitch, yaw], axis=1)).astype(np.float32)
         for n, (force, own) in enumerate(zip(power[:, 0].astype(np.float32), angles, strict=True), 2):
             labels |= {f"lamp{n}": force, f"lamp{n}_pitch": own[0], f"lamp{n}_yaw": own[1]}
-        every = np.vstack([lamp, np.hstack([power, rows @ turn.T])])
-        return lighting(ambient, every, gloss, haze, size if self.shadows else 0), labels
+        every = np.vstack([lamp, np.hstack([power, rows @ turn.T])]).astype(np.float32)
+        room = (len(every), TEXELS * size, TEXELS * size) if self.shadows else (0, 0, 0)
+        empty = (np.zeros(shape, np.float32) for shape in ((len(every), 2, 3), 3, room))
+        return Lighting(ambient, every, gloss, haze, *empty), labels
 
 
 def _even_in_log(ends: Range, share: float) -> float:
