@@ -7,7 +7,7 @@ have parted. Leaves out highlights, single strands, plaits, and hair that hangs 
 """
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,10 +75,6 @@ class Skin(NamedTuple):
     thickness: Float32[ndarray, "rows columns"]  # of hair and clothes, face pixels
     forward: Float32[ndarray, "rows columns"]  # how far hair hangs forward, face pixels
     parts: ndarray  # numbers into MASK_CLASSES
-
-
-def hair_style(who: Identity) -> HairStyle:
-    return HairStyle(*numbers_of("faces")["hair_styles"][who["hair_style"]])
 
 
 @lru_cache(maxsize=4)
@@ -158,9 +154,9 @@ def _waves(
     return total * np.sqrt(2.0 / count)
 
 
-def paint_skin(who: Identity, shape: FaceShape, fields: dict[str, ndarray]) -> Skin:
+def paint_skin(who: Identity, style: HairStyle, shape: FaceShape, fields: dict[str, ndarray]) -> Skin:
     """One person's skin, brows, beard, clothes and hair."""
-    grid, parts, style = shape.grid, fields["parts"].copy(), hair_style(who)
+    grid, parts = shape.grid, fields["parts"].copy()
     albedo, thickness = _bare_skin(who, fields, style), np.zeros(grid.p.shape, np.float32)
     strands = 1.0 + 0.09 * fields["strands"] + 0.05 * fields["mottling"][0]
     strand_colour = _rgb(who["hair"]) * strands
@@ -338,48 +334,41 @@ class ProceduralFaces:
     shape: FaceShape
     fields: dict[str, ndarray]
 
-    @classmethod
-    def of(cls, detail: float) -> "ProceduralFaces":
-        """Those on a grid of that ``detail``."""
-        return cls(face_shape(detail), skin_fields(detail))
-
     def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshOf, Row, Row]:
         """One identity: its mesh by expression, its labels, and its traits for tables."""
         shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
         who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
-        skin = paint_skin(who, shape, self.fields)
-        surface = shape.mean.copy()
+        style = HairStyle(*numbers_of("faces")["hair_styles"][who["hair_style"]])
+        skin, scale = paint_skin(who, style, shape, self.fields), np.float32(who["scale"])
+        neutral = shape.mean.copy()  # face pixels
         for weight, mode in zip(who["shape"].values(), shape.modes, strict=True):
-            surface += np.float32(weight) * mode
-        if not hair_style(who).covers_ears:
-            surface += np.float32(who["ear_size"]) * shape.ear
-        tip = float(surface[..., 2].min()) * who["scale"]
-        surface += skin.thickness[..., None] * shape.outward
-        surface[..., 2] -= skin.forward
+            neutral += np.float32(weight) * mode
+        if not style.covers_ears:
+            neutral += np.float32(who["ear_size"]) * shape.ear
+        nose_tip = float(neutral[..., 2].min()) * who["scale"]
+        neutral += skin.thickness[..., None] * shape.outward
+        neutral[..., 2] -= skin.forward
+        neutral *= scale
         labels: Row = {"age": round(who["age_years"], 1), "skin_tone": round(who["melanin"], 4)}
         labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
         labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
-        surface *= np.float32(who["scale"])
-        return partial(self._mesh, who, surface, tip, skin), labels, identity_columns(who)
 
-    def _mesh(
-        self, who: Identity, neutral: Float32[ndarray, "rows columns 3"], nose_tip: float, skin: Skin,
-        expression: Expression,
-    ) -> TriangleMesh:  # fmt: skip
-        """A neutral surface (face pixels) with an expression, in scene units; eyes and mouth painted."""
-        grid, scale, sides = self.shape.grid, np.float32(who["scale"]), expression.sides
-        surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
-        for a, side in np.argwhere(sides[: len(ACTIONS)]):
-            surface += sides[a, side] * scale * self.shape.actions[2 * a + side]
-        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
-        paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
-        paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
-        surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
-        surface *= np.float32(_FACE_PX)
-        surface[..., 2] += np.float32(NOSE_TIP_Z)
-        surface[..., 2] -= 1.0
-        colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
-        return TriangleMesh(surface.reshape(-1, 3), self.shape.triangles, colours, parts.ravel())
+        def mesh(expression: Expression) -> TriangleMesh:
+            grid, sides = shape.grid, expression.sides
+            surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
+            for a, side in np.argwhere(sides[: len(ACTIONS)]):
+                surface += sides[a, side] * scale * shape.actions[2 * a + side]
+            top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
+            paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
+            paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
+            surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
+            surface *= np.float32(_FACE_PX)  # scene units
+            surface[..., 2] += np.float32(NOSE_TIP_Z)
+            surface[..., 2] -= 1.0
+            colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
+            return TriangleMesh(surface.reshape(-1, 3), shape.triangles, colours, parts.ravel())
+
+        return mesh, labels, identity_columns(who)
 
 
 def _single(values: Any) -> ndarray:

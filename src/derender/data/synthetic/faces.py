@@ -13,8 +13,8 @@ import numpy as np
 from numpy import ndarray
 
 from derender.data import MASK_CLASSES, Progress
-from derender.data.synthetic.face_shape import ACTIONS, LID_ACTIONS, Expression
-from derender.data.synthetic.face_skin import ProceduralFaces
+from derender.data.synthetic.face_shape import ACTIONS, LID_ACTIONS, Expression, face_shape
+from derender.data.synthetic.face_skin import ProceduralFaces, skin_fields
 from derender.data.synthetic.morphable import MorphableFaces
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
@@ -33,7 +33,7 @@ def generate(
     """
     settings = settings or FaceSettings()
     detail = float(np.clip(np.ceil(image_size / 64 * 2) / 2, 1.0, 3.0))  # of the grid
-    family = ProceduralFaces.of(detail) if model is None else model
+    family = ProceduralFaces(face_shape(detail), skin_fields(detail)) if model is None else model
     family = MorphableFaces.read(family) if isinstance(family, (str, Path)) else family
 
     def shots(indices: list[int]) -> Iterator[Shot]:
