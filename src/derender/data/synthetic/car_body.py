@@ -85,7 +85,7 @@ class Surface:
     part: str = "trim"
     decals: Sequence[Decal] = ()
     folded: bool = False
-    holes: Sequence[tuple[float, float, float]] = ()
+    holes: Sequence[tuple[float, float, float]] = ((0.0, 0.0, 0.0),) * 2
 
 
 class Grid(NamedTuple):
@@ -112,9 +112,7 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
     cells = [grid_triangles(*g.points.shape[:2], (g.points.shape[1] - 1) / 2) for g in pieces]
     surfaces = list(dict.fromkeys(g.surface for g in pieces))
     owner = np.array([surfaces.index(g.surface) for g in pieces], np.int32)
-    holes, rows = np.zeros((len(surfaces), 2, 3), np.float32), [d for s in surfaces for d in s.decals]
-    for n, surface in enumerate(surfaces):
-        holes[n, : len(surface.holes)] = np.reshape(surface.holes, (-1, 3))
+    rows = [d for s in surfaces for d in s.decals]
     vertices, normals, chart = (
         np.concatenate([each.reshape(-1, each.shape[-1]) for each in arrays])
         for arrays in zip(*(g[:3] for g in pieces), strict=True)
@@ -129,7 +127,7 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
             colour=np.array([s.colour for s in surfaces], np.float32),
             part=np.array([PARTS.index(s.part) for s in surfaces], np.int32),
             folded=np.array([s.folded for s in surfaces]),
-            holes=holes,
+            holes=np.array([s.holes for s in surfaces], np.float32),
             first=np.cumsum([0, *(len(s.decals) for s in surfaces)]).astype(np.int32),
             decals=np.array(rows, np.float32).reshape(-1, DECAL_LENGTH),
         ),
@@ -146,12 +144,12 @@ def smooth_grid(points: Float[ndarray, "r c 3"], chart: Float[ndarray, "r c 2"],
 
 
 def rounded_box(
-    centre: Sequence[float], half: Sequence[float], radius: float, surfaces: Surface | Sequence[Surface],
-    lean_rad: float = 0.0,
+    centre: Sequence[float], half: Sequence[float], radius: float, surfaces: Sequence[Surface],
+    lean_rad: float,
 ) -> list[Grid]:  # fmt: skip
     """A box with rounded edges and no underside; ``lean_rad`` tips its top to the rear.
 
-    ``surfaces``: one for all faces, or those of top (chart x, z), front and rear (x, y) and sides (z, y).
+    ``surfaces`` are those of top (chart x, z), front and rear (x, y) and sides (z, y).
     """
     sizes, rim = np.asarray(half, float), _box_faces()
     core = sizes - min(radius, *half)
@@ -161,7 +159,7 @@ def rounded_box(
     turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     points = (flat + (sizes - core).min() * outward) @ turn.T + np.asarray(centre, float)
     normals = -(outward @ turn.T) * _DOWN
-    top, front, rear, side = [surfaces] * 4 if isinstance(surfaces, Surface) else surfaces
+    top, front, rear, side = surfaces
     faces = ((top, [0, 2]), (front, [0, 1]), (rear, [0, 1]), (side, [2, 1]), (side, [2, 1]))
     return [Grid(points[i], normals[i], points[i][..., axes], s) for i, (s, axes) in enumerate(faces)]
 

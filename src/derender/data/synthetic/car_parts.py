@@ -119,7 +119,7 @@ def build_car(car: CarTraits) -> TriangleMesh:
     """Mesh in metres (x right, y down, z to the rear; ground at y = 0) with its paint."""
     s, jeep, black = car.shape, car.name == "jeep", Surface(car.colour("black"))
     wheels = (s.front_wheel, s.rear_wheel)
-    holes = [] if jeep else [(at, s.wheel, ARCH * s.wheel) for at in wheels]
+    holes = [(at, s.wheel, 0.0 if jeep else ARCH * s.wheel) for at in wheels]
     side = Surface(car.paint, "body", side_paint(car), holes=holes)
     pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car), folded=True), side)
     tyre = Surface(car.colour("tyre"), "wheel", shapes("wheel", car))
@@ -132,7 +132,9 @@ def build_car(car: CarTraits) -> TriangleMesh:
             houses = [wheel_house(out - 0.25, at, s, flank, black)]
         pieces += both([template._replace(points=template.points + np.array((out, 0.0, at))), *houses])
     beside = s.cowl_at + (0.1 if car.has(["upright"]) else 0.28)
-    pieces += fittings(car, half_width(flank, beside, s.cowl - 0.05) + 0.09)
+    places = {**car.places, "mirror": half_width(flank, beside, s.cowl - 0.05) + 0.09}
+    for row in numbers_of("cars")["fittings"]:
+        pieces += fitting(car, places, *row)
     return join([*pieces, *([_spare_wheel(car)] if jeep else [])])
 
 
@@ -164,22 +166,16 @@ def _flat(numbers: Sequence[Any]) -> Iterator[str | float]:
         yield from number if isinstance(number, list) else [number]
 
 
-def fittings(car: CarTraits, mirror: float) -> list[Grid]:
-    """The rounded boxes on a car whose mirrors are ``mirror`` metres off the middle."""
-    places = {**car.places, "mirror": mirror}
-    return [piece for row in numbers_of("cars")["fittings"] for piece in _fitting(car, places, *row)]
-
-
-def _fitting(
+def fitting(
     car: CarTraits, places: Places, centre: Lengths, half: Lengths, radius: float, colour: str, part: str,
     conditions: Sequence[str], lean_rad: float = 0.0, charts: str | Sequence[str] = "",
 ) -> list[Grid]:  # fmt: skip
-    """A row of ``cars.yaml``, on both sides where it is not in the middle; nothing where it does not hold."""
+    """The rounded box of a row of ``cars.yaml``, on both sides where it is not in the middle; nothing where
+    the row does not hold."""
     if not car.has(conditions):
         return []
-    finish, of_faces = (car.colour(colour), car.chosen(part)), charts
-    if isinstance(charts, str):
-        of_faces = [charts] * 4
+    finish = car.colour(colour), car.chosen(part)
+    of_faces = [charts] * 4 if isinstance(charts, str) else charts
     surfaces = [Surface(*finish, shapes(chart, car)) for chart in of_faces]
     at, sides = ([metres(one, places) for one in row] for row in (centre, half))
     pieces = rounded_box(at, sides, radius, surfaces, lean_rad)
