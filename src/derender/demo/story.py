@@ -8,6 +8,7 @@ model is scored on the same faces. Leaves out the last page (see ``page``) and o
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +25,15 @@ from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import ScoreTable
 from derender.evaluation.truth import FactorResult, GeometryResult, evaluate_factors, evaluate_geometry
 from derender.features import embed_image_set
-from derender.learn import train as train_on
+from derender.learn import train
 from derender.model import Derenderer, load
 from derender.photo import find_faces, open_photograph
 from derender.postprocess.fitting import STEPS
 from derender.report.evidence import run_evidence
 from derender.report.page import Page, image_bytes
-from derender.report.run import decomposition_sheet, run_page
+from derender.report.run import run_page
 from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
-from derender.training.derender_task import train
 from derender.training.task import Progress, TrainResult
 
 EDITOR = "faces-64"
@@ -239,10 +239,8 @@ def run_demo(
     count = settings.train_pictures
     seen, _ = _generated(count, size, train_seed, lambda done, _: at(STAGES[0], done, count))
     unseen, truth = _generated(settings.test_pictures, size, test_seed)
-    trained = train(
-        config, seen, out / "run", sample_sheet=decomposition_sheet,
-        progress=lambda progress: live.follow(progress, at),
-    )  # fmt: skip
+    follow = partial(live.follow, report=at)
+    trained = train(seen, out=out / "run", config=config, page=False, progress=follow)
     if not (out / "run" / "model").exists():
         reason = "; ".join(finding.text for finding in trained.findings) or trained.stopped
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
@@ -290,10 +288,7 @@ def run_own_demo(
     own = ("warmup", "objective", "image", "batch", "whitening", "fitting")
     plain = tuple(one for one in settings.overrides if one.startswith(own))
     config = settings.model_copy(update={"overrides": plain}).training(seed, split=(0.8, 0.1, 0.1))
-
-    train_on(
-        images, out=run, config=config, page=False, progress=lambda progress: live.follow(progress, report)
-    )
+    train(images, out=run, config=config, page=False, progress=partial(live.follow, report=report))
     report(STAGES[4], 0, 1, "")
     page = run_page(run, run_evidence(run, images))
     values = {**page.values, "opening": live.opening}
