@@ -106,7 +106,14 @@ def align(
     """
     if not (8 <= size <= 4096 and 0 <= margin <= 2):
         raise ValueError(f"size must be 8 to 4096 and margin 0 to 2, got {size} and {margin:g}")
-    cutter = _Cutter(Path(out), size, margin, largest, keep, *_known(model))
+    loaded = None if model is None else as_model(model)
+    template = UTKFACE if loaded is None else template_of(loaded)
+    if template is None:
+        raise ValueError(
+            f"{model} is not known to be of faces: choose faces-64 or rendered-faces-64, or none"
+        )
+    held_out = read_errors(loaded.source) if loaded is not None and loaded.source is not None else None
+    cutter = _Cutter(Path(out), size, margin, largest, keep, template, loaded, held_out)
     boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"
     if boxes.exists() and not overwrite:
         raise FileExistsError(f"{boxes} exists already: choose another folder, or replace it (--force)")
@@ -199,19 +206,17 @@ class _Cutter:
         return frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0
 
     def _write(self, pixels: np.ndarray, frame: Frame, photo: str, number: int) -> str:
-        """Write a part of a photograph as the face of that number; the name of its file."""
-        file = self._name(str(PurePosixPath(photo).with_suffix("")), number)
-        with atomic_file(self.out / file) as temporary:
-            cut = frame.cut(pixels, self.size).transpose(1, 2, 0)
-            Image.fromarray(np.ascontiguousarray(cut)).save(temporary, format="PNG")
-        return file
+        """Write a part of a photograph as the face of that number; the name of its file.
 
-    def _name(self, stem: str, number: int) -> str:
-        """A crop's name that no other has: images may differ in their suffix only, or be numbered."""
-        stem = stem.lstrip("/").replace("..", "__")
+        No other crop has that name: images may differ in their suffix only, or be numbered.
+        """
+        stem = str(PurePosixPath(photo).with_suffix("")).lstrip("/").replace("..", "__")
         while (file := stem + (f"-{number}" if number > 1 else "") + ".png").casefold() in self.taken:
             number += 1
         self.taken.add(file.casefold())
+        with atomic_file(self.out / file) as temporary:
+            cut = frame.cut(pixels, self.size).transpose(1, 2, 0)
+            Image.fromarray(np.ascontiguousarray(cut)).save(temporary, format="PNG")
         return file
 
     def _doubt(self, pixels: np.ndarray, face: Face, frame: Frame) -> str:
@@ -236,20 +241,6 @@ def _row(
     return (
         dict.fromkeys(COLUMNS, "") | row | {name: str(round(float(one), 4)) for name, one in numbers.items()}
     )
-
-
-def _known(model: Derenderer | str | Path | None) -> tuple[Template, Derenderer | None, HeldOutErrors | None]:
-    """Where a model has its faces, the model, and its held-out errors."""
-    if model is None:
-        return UTKFACE, None, None
-    loaded = as_model(model)
-    template = template_of(loaded)
-    if template is None:
-        raise ValueError(
-            f"{model} is not known to be of faces: choose faces-64 or rendered-faces-64, or none"
-        )
-    assert loaded.source is not None  # template_of knows models by it
-    return template, loaded, read_errors(loaded.source)
 
 
 def _read(file: Path) -> tuple[dict[str, Any] | None, list[dict[str, str]]]:

@@ -128,7 +128,7 @@ class PhotoDetail:
         faded, drawn = self._faded(ratio, inside) ** lit, colours * shading
         fields = (shift, mirror_shift, seen, mirror_seen, faded, mirror_ratio, drawn, *veils)
         image, depth = self._composed(fields, doubts), self.photo.new_zeros(count, self.size, self.size)
-        depth[:, *self.visible] = self._enlarged(view.depth[:, None])[:, 0]
+        depth[:, *self.visible] = self._enlarged(view.depth[:, None])[0][:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
 
     def _faded(self, ratio: Tensor, inside: Float[Tensor, "n 1 w w"]) -> Float[Tensor, "n 1 w w"]:
@@ -188,13 +188,13 @@ class PhotoDetail:
         """
         shift, mirror_shift, seen, mirror_seen, ratio, mirror_ratio, drawn, veil, mirror_veil, new = fields
         doubts = doubts.expand(-1, -1, *seen.shape[2:])
-        shown = self._all_enlarged(shift, ratio, drawn, doubts, seen, veil, new)
+        shown = self._enlarged(shift, ratio, drawn, doubts, seen, veil, new)
         shift, ratio, drawn, doubts, seen, veil, new = shown
         drawn = drawn.clamp(DARKEST, 1)
         image = seen * self._detailed(shift, ratio, drawn, doubts, veil, new)
         if bool((unseen := (seen < 0.999).any(dim=0)[0]).any()):
             part = (..., *(slice(int(at.min()), int(at.max()) + 1) for at in unseen.nonzero().T))
-            mirrored = self._all_enlarged(mirror_shift, mirror_ratio, mirror_seen, mirror_veil, part=part)
+            mirrored = self._enlarged(mirror_shift, mirror_ratio, mirror_seen, mirror_veil, part=part)
             shift, ratio, weight, veil = mirrored
             drawn, doubts, seen, new = (field[part] for field in (drawn, doubts, seen, new))
             other = self._detailed(shift, ratio, drawn, doubts, veil, new, part)
@@ -227,16 +227,14 @@ class PhotoDetail:
         surface = edited + torch.lerp(lit * _smooth(wrong, lit, DETAIL_SHARE * self.size), wrong, moved)
         return _veiled(surface.clamp(max=0).exp(), new) + beyond
 
-    def _all_enlarged(self, *fields: Tensor, part: tuple[Any, ...] = (...,)) -> tuple[Tensor, ...]:
-        sizes = [field.shape[1] for field in fields]
-        return self._enlarged(torch.cat(fields, dim=1), part).split(sizes, dim=1)
-
-    def _enlarged(self, fields: Tensor, part: tuple[Any, ...] = (...,)) -> Tensor:
+    def _enlarged(self, *fields: Tensor, part: tuple[Any, ...] = (...,)) -> tuple[Tensor, ...]:
         """Fields of the wide grid at the photograph's visible pixels, or a part of these."""
         places = ((torch.arange(self.size) + 0.5) / self.size - 0.5) * self.span * self.model_size
         across = places / (self.model_size - 1) * (self.grid - 1)  # from the middle, in grid pixels
-        centres = self._square_seen(across * 2 / (self.wide - 1), part).expand(len(fields), -1, -1, -1)
-        return sampled(fields, centres, padding_mode="border", align_corners=True)
+        joined = torch.cat(fields, dim=1)
+        centres = self._square_seen(across * 2 / (self.wide - 1), part).expand(len(joined), -1, -1, -1)
+        enlarged = sampled(joined, centres, padding_mode="border", align_corners=True)
+        return enlarged.split([field.shape[1] for field in fields], dim=1)
 
     def _square_seen(self, along: Tensor, part: tuple[Any, ...]) -> Float[Tensor, "1 r c 2"]:
         return _square(along.to(self.photo))[:, *self.visible][(*part, slice(None))]

@@ -8,6 +8,7 @@ given: a Pillow image for a path or a Pillow image, an array for an array, a ten
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import radians
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -202,14 +203,11 @@ def relight(
     _check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     if not 0 <= strength < float("inf"):
         raise ValueError(f"strength must be 0 or more, got {strength}")
-    other = None
-    if like is not None:
-        other = open_photograph(as_photos(like)[0], loaded, frame=frame, fit_steps=fit_steps).scene.lighting
-
-    def edited(photo: Photograph) -> np.ndarray:
-        return photo.relit(yaw_deg, pitch_deg, strength) if other is None else photo.edited(**other)
-
-    return _each(image, lambda one: edited(open_photograph(one, loaded, frame=frame, fit_steps=fit_steps)))
+    opened = partial(open_photograph, model=loaded, frame=frame, fit_steps=fit_steps)
+    if like is None:
+        return _each(image, lambda one: opened(one).relit(yaw_deg, pitch_deg, strength))
+    lighting = opened(as_photos(like)[0]).scene.lighting
+    return _each(image, lambda one: opened(one).edited(**lighting))
 
 
 def rotate(
@@ -230,12 +228,8 @@ def rotate(
     """
     loaded = as_model(model)
     _check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
-
-    def turned(pixels: np.ndarray) -> np.ndarray:
-        photo = open_photograph(pixels, loaded, frame=frame, fit_steps=fit_steps)
-        return photo.rotated(yaw_deg, pitch_deg)
-
-    return _each(image, turned)
+    opened = partial(open_photograph, model=loaded, frame=frame, fit_steps=fit_steps)
+    return _each(image, lambda one: opened(one).rotated(yaw_deg, pitch_deg))
 
 
 class FoundFrame(NamedTuple):

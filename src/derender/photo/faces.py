@@ -92,8 +92,8 @@ def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
     candidates: list[Face] = []
     for quarter in range(4):
         turned = np.ascontiguousarray(np.rot90(small, -quarter))
-        results = [_turned(face, quarter, small.shape[:2]) for face in _both_ways(turned, twice=False)]
-        checked = [_checked(photo, _scaled(face, scale)) for face in results]
+        results = _both_ways(turned, twice=False)
+        checked = [_checked(photo, _placed(face, quarter, small.shape[:2], scale)) for face in results]
         candidates += checked
         if any(not face.rejected for face in checked):
             break
@@ -129,20 +129,16 @@ def _checked(photo: UInt8[np.ndarray, "h w 3"], face: Face) -> Face:
     """The face as it is found in cuts around it, upright, on average; rejected where the first has none."""
     frame = frame_of(face, UTKFACE)
     result = _in_cut(photo, frame, CUTS[0])
-    face = _with_yaw(photo, result or face, frame.roll_deg)
+    left, top, right, bottom = (result or face).box
+    side = CROP_SIDE * max(right - left, bottom - top)
+    crop = Frame((left + right) / 2, (top + bottom) / 2, side, frame.roll_deg).cut(photo, CROP)
+    face = replace(result or face, yaw_deg=yaw_deg(crop))
     if result is None:
         return replace(face, rejected="not found again where it is cut out upright")
     if face.confidence < CONFIDENT:
         return replace(face, rejected=f"confidence {face.confidence:.3f} is below {CONFIDENT}")
     again = [face, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
     return replace(face, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
-
-
-def _with_yaw(photo: UInt8[np.ndarray, "h w 3"], face: Face, roll_deg: float) -> Face:
-    left, top, right, bottom = face.box
-    side = CROP_SIDE * max(right - left, bottom - top)
-    crop = Frame((left + right) / 2, (top + bottom) / 2, side, roll_deg).cut(photo, CROP)
-    return replace(face, yaw_deg=yaw_deg(crop))
 
 
 def _in_cut(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, share: float) -> Face | None:
@@ -164,18 +160,15 @@ def _in_cut(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, share: float) -> Fa
     return Face(box, np.array(points, np.float32), face.confidence)
 
 
-def _scaled(face: Face, scale: float) -> Face:
-    return replace(face, box=tuple(scale * at for at in face.box), points=face.points * np.float32(scale))
-
-
-def _turned(face: Face, quarters: int, shape: tuple[int, ...]) -> Face:
-    """A face of an image turned clockwise by quarters, as it lies in the image (of ``shape``) itself."""
+def _placed(face: Face, quarters: int, shape: tuple[int, ...], scale: float) -> Face:
+    """A face of an image turned clockwise by quarters, as it lies in the image (of ``shape``), enlarged."""
     points = np.array([*zip(face.box[::2], face.box[1::2], strict=True), *face.points.tolist()])
     height, width = shape if quarters % 2 == 0 else shape[::-1]
     for _ in range(quarters):
         points, height, width = np.stack((points[:, 1], width - points[:, 0]), axis=1), width, height
     low, high = points[:2].min(axis=0), points[:2].max(axis=0)
-    return replace(face, box=(*low.tolist(), *high.tolist()), points=points[2:].astype(np.float32))
+    box = tuple(scale * at for at in (*low.tolist(), *high.tolist()))
+    return replace(face, box=box, points=points[2:].astype(np.float32) * np.float32(scale))
 
 
 def _detected(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:

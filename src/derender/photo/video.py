@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from derender.model import Derenderer
@@ -109,9 +109,9 @@ def edit_video(
     def drawn() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         for number, pixels in enumerate(_frames(video)):
             photo = Photograph.of(pixels, frames[number], scene[number], model)
-            image = photo(edited[number]).image[0]
+            result = photo.edited(**edited[number].parameters)
             report(number + 1, count, description="drawing")
-            yield (255 * image).round().byte().permute(1, 2, 0).numpy()
+            yield result
 
     write_video(out, drawn(), (width, height), fps, video)
     searched = len(range(0, count, every)) if faces else 0
@@ -203,9 +203,8 @@ def _over_time(values: np.ndarray, frames: float) -> np.ndarray:
 
 def _smooth(scene: Scene, fps: float) -> Scene:
     """The scenes of consecutive frames, each parameter smoothed over time."""
-
-    def smoothed(name: str, values: Float[Tensor, "n ..."]) -> Tensor:
-        seconds = SMOOTH_SECONDS.get(name, SMOOTH_SECONDS["albedo"])
-        return torch.from_numpy(_over_time(values.cpu().numpy(), seconds * fps)).to(values)
-
-    return scene.with_parameters(**{name: smoothed(name, value) for name, value in scene.parameters.items()})
+    smoothed = {}
+    for name, values in scene.parameters.items():
+        frames = SMOOTH_SECONDS.get(name, SMOOTH_SECONDS["albedo"]) * fps
+        smoothed[name] = torch.from_numpy(_over_time(values.cpu().numpy(), frames)).to(values)
+    return scene.with_parameters(**smoothed)
