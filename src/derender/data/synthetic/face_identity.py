@@ -19,9 +19,8 @@ _GREY = np.array((0.70, 0.69, 0.67))
 
 
 def draw_identity(
-    generator: np.random.Generator, modes: tuple[str, ...], age_years: Range = (YOUNG, OLD),
-    skin_tone: Range = (0.0, 1.0),
-) -> Identity:  # fmt: skip
+    generator: np.random.Generator, modes: tuple[str, ...], age_years: Range, skin_tone: Range
+) -> Identity:
     """One person of an age and a skin tone within those ranges: traits that no image changes, by name.
     Colours are stored RGB values, 0..1; lengths are face pixels."""
     numbers, uniform = numbers_of("faces"), generator.uniform

@@ -16,11 +16,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32
 from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
-from derender.data.synthetic.mesh_image import grid_triangles, unit
+from derender.data.synthetic.mesh_image import unit
 from derender.data.synthetic.settings import numbers_of
 
 THETA_MAX = np.deg2rad(112.0)
@@ -53,7 +53,6 @@ class FaceShape:
     """A linear family of surfaces (rows, columns, 3) in face pixels."""
 
     grid: FaceGrid
-    triangles: Int32[ndarray, "f 3"]  # of the grid's vertices row by row
     mean: Float[ndarray, "rows columns 3"]  # the mean head without ears; symmetric
     ear: Float[ndarray, "rows columns 3"]  # displacement by ears, kept apart because hair may cover them
     outward: Float[ndarray, "rows columns 3"]  # out of the bare head, level below the ears, where hair hangs
@@ -91,7 +90,6 @@ def face_shape(detail: float = 1.0) -> FaceShape:
     low = smoothstep(2.0, 20.0, grid.q)[..., None]
     return FaceShape(
         grid,
-        grid_triangles(*grid.p.shape),
         mean=_mean_head(grid, head).astype(np.float32),
         ear=_ear(grid).astype(np.float32),
         outward=unit((1.0 - low) * normal + low * level).astype(np.float32),

@@ -6,7 +6,6 @@ are painted over it: lids follow the expression, irises the gaze; the mouth's in
 have parted. Leaves out highlights, single strands, plaits, and hair that hangs free of the head.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -33,7 +32,7 @@ from derender.data.synthetic.face_shape import (
     hill,
     smoothstep,
 )
-from derender.data.synthetic.mesh_image import TriangleMesh
+from derender.data.synthetic.mesh_image import TriangleMesh, grid_triangles
 from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshOf
 from derender.data.synthetic.settings import FaceSettings, numbers_of
 from derender.data.synthetic.synthetic_set import Row
@@ -327,48 +326,44 @@ def paint_mouth(
     parts[at] = np.where((cover > 0.5) & (parted > 0.5), PART["mouth"], parts[at])
 
 
-@dataclass(frozen=True)
-class ProceduralFaces:
-    """The built-in faces; a user's own morphable model has the same method."""
+def built_in_person(
+    shape: FaceShape, fields: dict[str, ndarray], seed: int, identity: int, settings: FaceSettings
+) -> tuple[MeshOf, Row, Row]:
+    """One identity: its mesh by expression, its labels, and its traits for tables."""
+    generator = np.random.default_rng([seed, 2, identity])
+    who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
+    style = HairStyle(*numbers_of("faces")["hair_styles"][who["hair_style"]])
+    skin, scale = paint_skin(who, style, shape, fields), np.float32(who["scale"])
+    neutral = shape.mean.copy()  # face pixels
+    for weight, mode in zip(who["shape"].values(), shape.modes, strict=True):
+        neutral += np.float32(weight) * mode
+    if not style.covers_ears:
+        neutral += np.float32(who["ear_size"]) * shape.ear
+    nose_tip = float(neutral[..., 2].min()) * who["scale"]
+    neutral += skin.thickness[..., None] * shape.outward
+    neutral[..., 2] -= skin.forward
+    neutral *= scale
+    labels: Row = {"age": round(who["age_years"], 1), "skin_tone": round(who["melanin"], 4)}
+    labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
+    labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
 
-    shape: FaceShape
-    fields: dict[str, ndarray]
+    def mesh(expression: Expression) -> TriangleMesh:
+        grid, sides = shape.grid, expression.sides
+        surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
+        for a, side in np.argwhere(sides[: len(ACTIONS)]):
+            surface += sides[a, side] * scale * shape.actions[2 * a + side]
+        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
+        paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
+        paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
+        surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
+        surface *= np.float32(_FACE_PX)  # scene units
+        surface[..., 2] += np.float32(NOSE_TIP_Z)
+        surface[..., 2] -= 1.0
+        colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
+        triangles = grid_triangles(*parts.shape)
+        return TriangleMesh(surface.reshape(-1, 3), triangles, colours, parts.ravel())
 
-    def person(self, seed: int, identity: int, settings: FaceSettings) -> tuple[MeshOf, Row, Row]:
-        """One identity: its mesh by expression, its labels, and its traits for tables."""
-        shape, generator = self.shape, np.random.default_rng([seed, 2, identity])
-        who = draw_identity(generator, shape.names, settings.age_years, settings.skin_tone)
-        style = HairStyle(*numbers_of("faces")["hair_styles"][who["hair_style"]])
-        skin, scale = paint_skin(who, style, shape, self.fields), np.float32(who["scale"])
-        neutral = shape.mean.copy()  # face pixels
-        for weight, mode in zip(who["shape"].values(), shape.modes, strict=True):
-            neutral += np.float32(weight) * mode
-        if not style.covers_ears:
-            neutral += np.float32(who["ear_size"]) * shape.ear
-        nose_tip = float(neutral[..., 2].min()) * who["scale"]
-        neutral += skin.thickness[..., None] * shape.outward
-        neutral[..., 2] -= skin.forward
-        neutral *= scale
-        labels: Row = {"age": round(who["age_years"], 1), "skin_tone": round(who["melanin"], 4)}
-        labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
-        labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
-
-        def mesh(expression: Expression) -> TriangleMesh:
-            grid, sides = shape.grid, expression.sides
-            surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
-            for a, side in np.argwhere(sides[: len(ACTIONS)]):
-                surface += sides[a, side] * scale * shape.actions[2 * a + side]
-            top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
-            paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
-            paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
-            surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
-            surface *= np.float32(_FACE_PX)  # scene units
-            surface[..., 2] += np.float32(NOSE_TIP_Z)
-            surface[..., 2] -= 1.0
-            colours = np.ascontiguousarray(albedo.reshape(3, -1).T)
-            return TriangleMesh(surface.reshape(-1, 3), shape.triangles, colours, parts.ravel())
-
-        return mesh, labels, identity_columns(who)
+    return mesh, labels, identity_columns(who)
 
 
 def _single(values: Any) -> ndarray:

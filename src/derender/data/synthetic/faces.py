@@ -7,6 +7,7 @@ Conventions are those of docs/reference/conventions.md; nose tips of neutral fac
 """
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy import ndarray
 
 from derender.data import MASK_CLASSES, Progress
 from derender.data.synthetic.face_shape import ACTIONS, LID_ACTIONS, Expression, face_shape
-from derender.data.synthetic.face_skin import ProceduralFaces, skin_fields
+from derender.data.synthetic.face_skin import built_in_person, skin_fields
 from derender.data.synthetic.morphable import MorphableFaces
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
@@ -32,13 +33,15 @@ def generate(
     ``model`` replaces the built-in faces by those of a morphable model (a file as in ``morphable``).
     """
     settings = settings or FaceSettings()
-    detail = float(np.clip(np.ceil(image_size / 64 * 2) / 2, 1.0, 3.0))  # of the grid
-    family = ProceduralFaces(face_shape(detail), skin_fields(detail)) if model is None else model
-    family = MorphableFaces.read(family) if isinstance(family, (str, Path)) else family
+    if model is None:
+        detail = float(np.clip(np.ceil(image_size / 64 * 2) / 2, 1.0, 3.0))  # of the grid
+        person = partial(built_in_person, face_shape(detail), skin_fields(detail))
+    else:
+        person = (model if isinstance(model, MorphableFaces) else MorphableFaces.read(model)).person
 
     def shots(indices: list[int]) -> Iterator[Shot]:
         number = settings.first_identity + indices[0] // settings.per_identity
-        mesh_of, known, traits = family.person(seed, number, settings)
+        mesh_of, known, traits = person(seed, number, settings)
         for index in indices:
             expression, background, light, camera, labels = draw_face(seed, index, image_size, settings)
             yield Shot(mesh_of(expression), background, light, camera, number, labels | known, traits)
