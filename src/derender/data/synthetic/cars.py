@@ -63,9 +63,8 @@ class Car:
     mesh: TriangleMesh
 
 
-def model_car(seed: int, number: int, settings: CarSettings | None = None) -> Car:
+def model_car(seed: int, number: int, settings: CarSettings) -> Car:
     """Model ``number`` of a seed, as ``generate`` renders it."""
-    settings = settings or CarSettings()
     traits = draw_traits(class_of(seed, number, settings), np.random.default_rng([seed, 5, number]))
     mesh = build_car(traits)
     upright = mesh.vertices.astype(np.float64)
@@ -96,12 +95,11 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
     kind = settings.backgrounds[int(uniform[7] * len(settings.backgrounds))]
     turn = Rotation.from_euler("ZXY", [inplane, elevation, azimuth], degrees=True).as_matrix()
     rotation = turn @ about_x(CANONICAL_ELEVATION_DEG).T
-    x, y, z = rotation @ car.mesh.vertices.T
-    reach = np.tan(np.deg2rad(FOV_DEG / 2)) * (z + 1.0)
-    low = np.array([(-reach - x).max(), (-reach - y).max()])  # so that all vertices stay in the image
-    high, (least, most) = np.array([(reach - x).min(), (reach - y).min()]), view.shift
-    shift = np.minimum(np.maximum(view.shift_sd * normal[1:], least), most)
-    shift = np.where(low < high, np.minimum(np.maximum(shift, low), high), 0.5 * (low + high))
+    place = rotation @ car.mesh.vertices.T
+    reach = np.tan(np.deg2rad(FOV_DEG / 2)) * (place[2] + 1.0)  # within which all vertices must stay
+    low, high = (-reach - place[:2]).max(axis=1), (reach - place[:2]).min(axis=1)
+    shift = np.clip(view.shift_sd * normal[1:], *view.shift)
+    shift = np.where(low < high, np.clip(shift, low, high), 0.5 * (low + high))
     name = car.traits.name
     labels: Row = {"class": name, "style": car.traits.style, "model": f"{name}/{number:05d}"}
     labels |= {"elev": np.float32(elevation), "azim": np.float32(azimuth), "inplane": np.float32(inplane)}

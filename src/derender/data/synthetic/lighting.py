@@ -9,7 +9,6 @@ edge is averaged over 2 x 2 texels. Leaves out light reflected from one part ont
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from derender.render.numba_threads import kernel
@@ -88,10 +87,3 @@ def _lit(lighting, number, cosine, x, y, z):
         if lighting.maps[number, q + below, p + right] <= near:
             total += (a if right else _ONE - a) * (b if below else _ONE - b)
     return total
-
-
-def axes_about(direction: Float[ndarray, "3"]) -> Float[ndarray, "2 3"]:
-    """Two unit vectors that make a right-handed frame with a third."""
-    first = np.cross((0.0, 1.0, 0.0) if abs(direction[1]) < 0.9 else (1.0, 0.0, 0.0), direction)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)])

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int32
 from numpy import ndarray
 
 from derender.data.synthetic.decals import NO_PAINT, SAMPLES, Paint, paint_samples
-from derender.data.synthetic.lighting import Lighting, axes_about, light_at
+from derender.data.synthetic.lighting import Lighting, light_at
 from derender.render.numba_threads import kernel
 
 _ALL = SAMPLES * SAMPLES
@@ -310,7 +310,10 @@ def _cast_shadows(
     light.centre[:] = translation + np.array([0, 0, 1], np.float32)
     more, holes = np.zeros((len(points), 8), np.float32), np.zeros((0, 2, 3), np.float32)
     for lamp, across, nearest in zip(light.lamps, light.across, light.maps, strict=True):
-        across[:] = scale * axes_about(lamp[1:].astype(float))
+        direction = lamp[1:].astype(float)
+        first = np.cross((0.0, 1.0, 0.0) if abs(direction[1]) < 0.9 else (1.0, 0.0, 0.0), direction)
+        first /= np.linalg.norm(first)
+        across[:] = scale * np.stack([first, np.cross(direction, first)])
         places = np.empty((len(points), 3), np.float32)
         places[:, :2] = points @ across.T + 0.5 * (size - 1)
         places[:, 2] = 1 - points @ lamp[1:]

@@ -162,7 +162,6 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
 
 
 DEPTH_LOW, DEPTH_SPAN, EFFECT_SPAN = 0.8, 0.4, 2.0
-_MAPS = ("depth", "normal", "albedo", "mask", "masks")
 
 
 def write(
@@ -174,13 +173,14 @@ def write(
     images are written. A FileExistsError: the folder holds something.
     """
     require_empty(folder := Path(folder))
-    files, maps = [f"images/{i:06d}.jpg" for i in range(len(synthetic))], (*_MAPS, *synthetic.effects)
+    files = [f"images/{i:06d}.jpg" for i in range(len(synthetic))]
     if "track" in synthetic.labels:
         shown = zip(synthetic.identity, synthetic.labels["track"], synthetic.labels["frame"], strict=True)
         files = [f"tracks/id{who:04d}/track_{track:03d}/{frame:03d}.jpg" for who, track, frame in shown]
         truth = False
     with atomic_folder(folder) as temporary:
-        for parent in {Path(file).parent for file in files} | set(map(Path, maps if truth else ())):
+        maps = map(Path, _encoded(synthetic, 0) if truth else ())
+        for parent in {*maps, *(Path(file).parent for file in files)}:
             (temporary / parent).mkdir(parents=True, exist_ok=True)
 
         def save(i: int) -> None:
