@@ -6,7 +6,7 @@ measure with more. A part that cannot be made is listed with its reason. Leaves 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,13 @@ import torch
 from jaxtyping import UInt8
 
 from derender.baselines import read_any_config
-from derender.baselines.controls import untrained_twin
 from derender.data import GroundTruth, ImageSet, Progress, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
 from derender.evaluation.disentanglement import disentangle
-from derender.evaluation.linear_task import choose_rows
 from derender.evaluation.pixels import evaluate_reconstruction, mean_image
 from derender.evaluation.truth import evaluate_factors, evaluate_geometry
-from derender.features import embed_image_set
 from derender.inputs import as_images, as_model
-from derender.interpretation import explain_labels, question
+from derender.interpretation import explain
 from derender.model import Derenderer
 from derender.report.charts import card_matrices, matrix_sheet
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
@@ -208,11 +205,7 @@ def _explained(subject: Subject) -> Values:
         known = ", ".join(subject.held_out.labels) or "none"
         raise ValueError(f"no label of 2 to {MOST_CLASSES} classes (labels: {known}): name one")
     sample = _sample(subject.held_out, EXPLAINED)
-    task = question(sample.labels, names, source=sample.source)
-    split = choose_rows(task, sample.files, (max(2, int(0.4 * task.known.sum())),), (0,))
-    table = embed_image_set(subject.model, sample)
-    fresh = embed_image_set(untrained_twin(subject.model, 0), sample).factors
-    result = explain_labels(table.factors, task, split, untrained=[fresh], seeds=(0,))
+    result = explain(replace(sample, partition=None), subject.model, names, seeds=1).shares
     shares = share_values(result, share_chart(result)[0])
     return {"count": f"{len(sample):,}", "names": ", ".join(names), "shares": shares}
 
@@ -229,6 +222,4 @@ def suitable_label(images: ImageSet) -> tuple[str, ...]:
 
 def _sample(images: ImageSet, most: int) -> ImageSet:
     """At most so many images, evenly through the set."""
-    if len(images) <= most:
-        return images
-    return images.select(np.linspace(0, len(images) - 1, most).round().astype(int))
+    return images.select(np.linspace(0, len(images) - 1, min(most, len(images))).round().astype(int))
