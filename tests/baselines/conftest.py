@@ -9,7 +9,7 @@ import torch
 from derender.baselines import baseline_config, train_baseline
 from derender.baselines.model import LossInputs
 from derender.data import ImageSet
-from derender.report.run import baseline_sheet
+from derender.report.run import sample_sheet
 
 COMMON = ["image_size=32", "batch_size=8", "checkpoint_every=24", "validate_every=24", "sample_every=48"]
 OWN = {
@@ -38,7 +38,7 @@ def runs(blobs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     for name in OWN:
         own = config(name, 48, *generator_of(name, folder))
-        train_baseline(own, blobs, folder / name, sample_sheet=baseline_sheet)
+        train_baseline(own, blobs, folder / name, sample_sheet=sample_sheet)
     torch.use_deterministic_algorithms(False)
     return folder
 

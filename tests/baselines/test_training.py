@@ -16,7 +16,7 @@ import derender
 from derender.baselines import load_baseline, network_type, read_any_config, train_baseline
 from derender.features import embed_image_set
 from derender.overrides import checked
-from derender.report.run import baseline_sheet, run_page
+from derender.report.run import run_page, sample_sheet
 from derender.training import resolve, train
 from derender.training.run_folder import read_config, read_metrics
 
@@ -57,7 +57,7 @@ def test_a_run_leaves_what_ours_leave_makes_a_table_and_resumes_exactly(name, ru
 def test_physical_views_train_and_the_renderer_stays_out_of_the_checkpoint(blobs, tmp_path):
     ours = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
     own = config("simclr", 16, "views=physical", f"physics={ours.save(tmp_path / 'ours')}")
-    train_baseline(own, blobs, tmp_path / "run", sample_sheet=baseline_sheet)
+    train_baseline(own, blobs, tmp_path / "run", sample_sheet=sample_sheet)
     assert {key.split(".")[0] for key in weights(tmp_path / "run")} == {"encoder", "head"}
     with pytest.raises(FileNotFoundError, match="no model at"):
         train_baseline(config("simclr", 16, "views=physical", "physics=nowhere"), blobs, tmp_path / "no")

@@ -114,9 +114,9 @@ def train(
     ours = isinstance(config, TrainConfig)
 
     def sheet(*given: Any) -> Any:
-        from derender.report import run as pages  # its import would delay the start by seconds
+        from derender.report.run import sample_sheet  # its import would delay the start by seconds
 
-        return (pages.decomposition_sheet if ours else pages.baseline_sheet)(*given)
+        return sample_sheet(*given)
 
     how = {"resume": resume, "progress": report, "accelerator": accelerator, "sample_sheet": sheet}
     result = (derender_task.train if ours else train_baseline)(config, images, out, **how)
@@ -226,11 +226,11 @@ def finetune(
             raise ValueError(f"{images.source} has no yes/no label: name one in labels")
         config = with_changes(config, target__labels=list(columns))
     task = FinetuneTask(config, images.images, target_of(images, config), start)
-    from derender.report.run import decomposition_sheet, run_page
+    from derender.report.run import run_page, sample_sheet
 
     run = train_task(
         task, images, out, resume=resume, progress=report, accelerator=accelerator,
-        sample_sheet=lambda tuned, few: decomposition_sheet(tuned.model, few),
+        sample_sheet=lambda tuned, few: sample_sheet(tuned.model, few),
     )  # fmt: skip
     run_page(out).write(out / "report.html")
     if not (out / "model").is_dir():

@@ -34,15 +34,11 @@ CHARTS = {
 }  # fmt: skip
 
 
-def decomposition_sheet(model: Derenderer, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
-    """Decompositions of some images: a labelled panel with a row for each."""
-    return decompose_images(model, pictures).sheet()
-
-
-def baseline_sheet(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
-    """What a baseline shows of some images (0..1): a row for each, a column for each kind."""
-    columns = model.shown(pictures)
-    return labelled_grid({name: colours.pictures(values) for name, values in columns.items()})
+def sample_sheet(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Image.Image:
+    """Decompositions of some images (0..1), or what a baseline shows of them: a row for each."""
+    if isinstance(model, Derenderer):
+        return decompose_images(model, pictures).sheet()
+    return labelled_grid({name: colours.pictures(values) for name, values in model.shown(pictures).items()})
 
 
 def run_page(folder: str | Path, evidence: Evidence | None = None) -> Page:
