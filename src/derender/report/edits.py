@@ -195,7 +195,7 @@ def _swept(
     def drawn(rows: Tensor, render: sweeps.Render) -> Images:
         return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), render)
 
-    places = sweeps.stills(film.stills)
+    places = torch.linspace(0, 1, film.stills)
     rows = values(places)
     labels = [label(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
     render, way, moving = image.render, sweeps.there_and_back(film.frames), []

@@ -1,13 +1,12 @@
 """One scene under many lightings or from many viewpoints: for strips of stills and for films that loop.
 
-A sweep is a function of places t between 0 and 1; ``stills`` and ``there_and_back`` give the places. Lights
+A sweep is a function of places t between 0 and 1, of which ``there_and_back`` gives those of a film. Lights
 are relative to the object (conventions.md), so the same light falls on the same side of every object,
 however it is rotated. Films become bytes: animated PNG (all colours, transparency), GIF (256 colours a
 frame), MP4 (H.264).
 """
 
 from collections.abc import Callable
-from io import BytesIO
 from math import inf, pi, radians
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +23,7 @@ from derender.photo.edit import AMBIENT_SHARE
 from derender.photo.video import write_video
 from derender.render import Rendering
 from derender.report.colours import Images, on_background, pictures
+from derender.report.page import image_bytes
 from derender.report.panel import strip
 from derender.scene import Scene
 
@@ -31,11 +31,6 @@ FRAMES_AT_ONCE = 8
 LOOP_FRAMES, LOOP_LIGHT_DEG, LOOP_VIEW_DEG = 16, 45.0, 35.0
 
 Render = Callable[[Scene], Rendering]
-
-
-def stills(count: int) -> Float[Tensor, " k"]:
-    """``count`` places, evenly from 0 to 1."""
-    return torch.linspace(0, 1, count)
 
 
 def there_and_back(frames: int) -> Float[Tensor, " k"]:
@@ -139,7 +134,7 @@ def _around(t: Tensor, reach_deg: float, pitch_deg: float) -> tuple[Tensor, Tens
 def animated_png(frames: Images) -> bytes:
     """An endless loop as the bytes of an animated PNG."""
     # disposal=1: each frame starts from an empty canvas, since frames have transparent parts
-    return _animated(frames, "PNG", round(2400 / len(frames)), disposal=1)
+    return _looping(frames, "PNG", round(2400 / len(frames)), disposal=1)
 
 
 def gif(frames: Images, seconds: float = 2.4) -> bytes:
@@ -151,14 +146,12 @@ def gif(frames: Images, seconds: float = 2.4) -> bytes:
     for key, frame in flat.items():
         flat[key] = on_background(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG).copy()
     frame_ms = 10 * max(2, round(100 * seconds / len(frames)))
-    return _animated([flat[id(frame)] for frame in frames], "GIF", frame_ms, optimize=False)
+    return _looping([flat[id(frame)] for frame in frames], "GIF", frame_ms, optimize=False)
 
 
-def _animated(frames: Images, form: str, frame_ms: int, **settings: Any) -> bytes:
-    stream = BytesIO()
+def _looping(frames: Images, form: str, frame_ms: int, **how: Any) -> bytes:
     first, *rest = frames
-    first.save(stream, format=form, save_all=True, append_images=rest, duration=frame_ms, loop=0, **settings)
-    return stream.getvalue()
+    return image_bytes(first, form, save_all=True, append_images=rest, duration=frame_ms, loop=0, **how)
 
 
 def mp4(frames: Images, seconds: float = 2.4) -> bytes:
