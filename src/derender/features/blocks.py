@@ -244,11 +244,11 @@ class Parts:
 
     def seen(self) -> set[bytes]:
         """The digests of every row there is."""
-        return {digest for (column,) in self._read("digest") for digest in column.to_pylist()}
+        return set(self._column("digest"))
 
-    def _read(self, *columns: str) -> Iterator[list[pa.ChunkedArray]]:
+    def _column(self, name: str) -> Iterator[Any]:
         for file in self.files:
-            yield pq.read_table(file, columns=list(columns)).columns
+            yield from pq.read_table(file, columns=[name])[name].to_pylist()
 
     def write(self, blocks: Sequence[Rows]) -> None:
         """Add a part: the rows of blocks in order."""
@@ -271,8 +271,8 @@ class Parts:
         self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None
     ) -> Iterator[FeatureTable]:
         """The finished table, part by part; labels are the ``known`` ones of all images, or the stream's."""
-        columns = self._read("labels") if known is None else ()
-        kinds = kinds_of(json.loads(text) for (texts,) in columns for text in texts.to_pylist())
+        texts = self._column("labels") if known is None else ()
+        kinds = kinds_of(map(json.loads, texts))
         names = sorted(kinds, key="partition".__ne__)  # the owners' split first
         for file in self.files:
             table = pq.read_table(file)

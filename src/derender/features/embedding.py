@@ -133,9 +133,8 @@ def embed_to_file(
                 images = stack.enter_context(reopen())
             else:
                 split = {**made_by, **(origin or {})}.get("source")
-                how = {"dataset": dataset, "limit": limit, "part": part, "model": split}
-                how["keep_duplicates"] = keep_duplicates
-                images, made_by["part"] = as_images(address, net.image_size, **how), part
+                how = {"dataset": dataset, "limit": limit, "part": part, "keep_duplicates": keep_duplicates}
+                images, made_by["part"] = as_images(address, net.image_size, **how, model=split), part
         assert isinstance(images, Stream | ImageSet)
         facts = {**model_facts(net, images.source, images.layout), **made_by, **(origin or {})}
         plan = _plan(net, images, facts, (fit, keep_duplicates), batch_size)
