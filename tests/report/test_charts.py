@@ -11,9 +11,15 @@ from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.robust import CurveResult, RobustnessComparison
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.report.charts import Matrix, card_matrices, matrix_sheet, side_by_side
-from derender.report.comparison import chart_of, comparison_page
 from derender.report.panel import GridLayout
-from derender.report.protocols import OPACITY, overlays, palette, segmentation_sheet
+from derender.report.protocols import (
+    OPACITY,
+    chart_of,
+    comparison_page,
+    overlays,
+    palette,
+    segmentation_sheet,
+)
 
 EVIL = "<script>alert(1)</script>"
 

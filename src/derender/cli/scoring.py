@@ -119,7 +119,7 @@ class Published(options.Output):
             if file is not None:
                 write_whole(file, form())
         if self.html is not None:
-            from derender.report.comparison import comparison_page
+            from derender.report.protocols import comparison_page
 
             facts = {name: one for name, one in values.items() if isinstance(one, str | int | float)}
             lead, title = ". ".join(notes), "Scores beside their controls"

@@ -36,7 +36,7 @@ from derender.features import FeatureTable, embed_image_set
 from derender.inputs import as_images, as_model, split_of
 from derender.learn.plan import OURS, WITHOUT_LOOP, ImageSource, Plan, ScoredSet, read_plan
 from derender.learn.runs import train
-from derender.report.comparison import comparison_page
+from derender.report.protocols import comparison_page
 from derender.settings import plain
 from derender.storage.atomic import measured, write_whole
 from derender.storage.bounded import read_json

@@ -1,14 +1,14 @@
-"""Curves of accuracy over angle as a chart; masks in colours over their images; what a search found.
+"""Results of protocols: a page of tables, each with a chart; curves over angle; masks over images; a search.
 
-The chart has a panel for each axis. Controls are grey and dashed; the 95 % interval of the first features is
-shaded. Masks stand beside the answers of several networks, with a legend; left and right of a pair share a
-hue. Leaves out computing anything (``derender.evaluation``).
+The chart of curves has a panel for each axis. Controls are grey and dashed; the 95 % interval of the first
+features is shaded. Masks stand beside the answers of several networks, with a legend; left and right of a
+pair share a hue. Leaves out computing anything (``derender.evaluation``).
 """
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import cycle
-from math import ceil
+from math import ceil, isfinite
 from pathlib import Path
 
 import numpy as np
@@ -16,23 +16,60 @@ from matplotlib.axes import Axes
 from matplotlib.colors import hsv_to_rgb
 from PIL import Image
 
+from derender import __version__
 from derender.data import Progress, Unreadable, decode, open_images, quiet_pillow, read_image
 from derender.evaluation.memory import content_hash
 from derender.evaluation.robust import SCORES, CurveResult, RobustnessComparison, level_name
+from derender.evaluation.score_table import ScoreTable
 from derender.evaluation.segmentation import SegmentationComparison
 from derender.features.neighbours import Found
 from derender.report import colours
-from derender.report.charts import SERIES, side_by_side
+from derender.report.charts import SERIES, bars, side_by_side
 from derender.report.colours import Images
-from derender.report.page import png_bytes
+from derender.report.page import DIRECTIONS, Page, png_bytes
 from derender.report.panel import PAPER, GridLayout, contact_sheet, labelled_grid
 from derender.storage.atomic import write_whole
+
+
+def comparison_page(
+    title: str,
+    tables: Sequence[ScoreTable],
+    *,
+    lead: str = "",
+    facts: Mapping[str, object] | None = None,
+    failed: Sequence[str] = (),
+) -> Page:
+    """A self-contained page with the tables in reading order, one or two sentences (``lead``) over them.
+
+    ``facts`` are models, data, seeds, settings; ``failed`` has a sentence for whatever is missing, with the
+    reason.
+    """
+    settings = {**(facts or {}), "derender": __version__}
+    shown = [(table, chart_of(table)) for table in tables]
+    return Page("comparison.html", title, lead, {"tables": shown, "failed": failed, "settings": settings})
+
+
+def chart_of(table: ScoreTable) -> tuple[str, str, str] | None:
+    """Bars of the first column that is a score, controls in grey; None where there are fewer than two.
+
+    As SVG text, its alternative text and its caption.
+    """
+    for place, column in enumerate(table.columns):
+        cells = ((row.name, row.cells[place]) for row in table.rows)
+        values = {name: float(x) for name, x in cells if isinstance(x, float | int) and isfinite(x)}
+        if column.best is not None and len(values) > 1:
+            models = [row.name for row in table.rows if not row.control]
+            svg = bars(values, f"{column.name} ({DIRECTIONS[column.best]})", models)
+            alt = f"{column.name} of {', '.join(f'{name} {column.text(v)}' for name, v in values.items())}"
+            return svg, alt, f"{column.name}; controls are grey."
+    return None
+
 
 CONTROL_LINES = ((0, (5, 2)), (0, (1, 1)), (0, (3, 1, 1, 1)), (0, (6, 1, 1, 1, 1, 1)))
 
 
-def robustness_chart(result: RobustnessComparison, score: str = "accuracy") -> tuple[str, bytes]:
-    """Every curve, a panel for each axis, as SVG text and as PNG."""
+def write_curves(result: RobustnessComparison, score: str, file: Path) -> None:
+    """Write a chart of every curve, .svg or .png, with a panel for each axis."""
 
     def draw(axes: Axes, curve: CurveResult) -> None:
         dashes = cycle({"color": "#64748b", "linestyle": line} for line in CONTROL_LINES)
@@ -54,12 +91,7 @@ def robustness_chart(result: RobustnessComparison, score: str = "accuracy") -> t
 
     panels = {curve.title: curve for curve in result.curves}
     size = (1.2 + 3.6 * max(2, len(panels)), 3.9)
-    return side_by_side(panels, draw, "degrees off the front", size, columns=5)
-
-
-def write_curves(result: RobustnessComparison, score: str, file: Path) -> None:
-    """Write the chart, .svg or .png."""
-    svg, png = robustness_chart(result, score)
+    svg, png = side_by_side(panels, draw, "degrees off the front", size, columns=5)
     write_whole(file, png if file.suffix.lower() == ".png" else svg.encode())
 
 
