@@ -263,7 +263,7 @@ class ImageFiles:
             notice(note)
         output.result(f"{places.counted(len(written.images), 'images')} in {self.out}")
         output.write(written.values())
-        if set(written.refused) & {str(path) for path in self.images}:  # of a folder others were used
+        if set(written.refused) & set(self.images):  # of a folder others were used
             raise typer.Exit(2)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -23,6 +23,9 @@ from derender.photo import edit_video, is_video
 from derender.photo.faces import TEMPLATES
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
+from derender.report.decomposition import Decomposition
+from derender.report.edits import Edit
+from derender.report.mesh import Mesh
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
@@ -37,18 +40,8 @@ ROWS = ".sheet"
 NAMED = 5
 """So many images that cannot be read are named."""
 
-
-class Edited(Protocol):
-    """What can be written for one image."""
-
-    @property
-    def row(self) -> Mapping[str, Image.Image]:
-        """Its row of a sheet over all images; empty for none."""
-        ...
-
-    def write(self, folder: Path, record: dict[str, Any], /) -> dict[str, Any]:
-        """Write its files to ``folder``; returns the record with what was written."""
-        ...
+Edited = Decomposition | Edit | Mesh
+"""What can be written for one image: ``write`` its files, and a ``row`` of the sheet over all images."""
 
 
 @dataclass(frozen=True)
@@ -58,18 +51,19 @@ class WrittenImages:
     out: Path  # the folder
     images: Sequence[dict[str, Any]]  # a record for each image, as its JSON file holds it
     sheets: Sequence[Path]  # files with a row for every image
-    refused: Mapping[str, str]  # reasons why other images cannot be read, by path
+    refused: Mapping[Path, str]  # reasons why other images cannot be read, by path
     # of the reconstruction errors, by path; empty where the model keeps none
-    percentiles: Mapping[str, float]
+    percentiles: Mapping[Path, float]
     # the part of each image that is shown, and how it was found, by path
-    framing: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    framing: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
     unlike: str = ""  # how images differ from those the model was validated on (``held_out_errors.unlike``)
     before: int = 0  # number of images that were left out, for their folders were there
     help: str = ""  # what to do with those that do not suit the model
 
     def notes(self) -> list[str]:
         """Lines for a person: what was left out, what is out-of-distribution, what was cropped."""
-        lines = [f"left out {path}: {why.removeprefix(path).lstrip()}" for path, why in self.refused.items()]
+        reasons = {path: why.removeprefix(str(path)).lstrip() for path, why in self.refused.items()}
+        lines = [f"left out {path}: {why}" for path, why in reasons.items()]
         if (more := len(lines) - NAMED) > 0:
             lines[NAMED:] = [f"and {more:,} more (--json names all)"]
         if self.help:
@@ -97,14 +91,12 @@ class WrittenImages:
 
     def values(self) -> dict[str, Any]:
         """All of it as JSON can hold it; keys are paths, for a name may be no UTF-8."""
-        by_path = (self.refused, self.percentiles, self.framing)
-        refused, percentiles, framing = ({Path(key): one for key, one in rows.items()} for rows in by_path)
         return {
             "out": self.out,
             "pictures": self.images,
-            "refused": refused,
-            "reconstruction_percentile": percentiles,
-            "framing": framing,
+            "refused": self.refused,
+            "reconstruction_percentile": self.percentiles,
+            "framing": self.framing,
             "sheets": self.sheets,
         }
 
@@ -155,7 +147,7 @@ def write_images(
     if doubts:
         better = fitting_better(np.stack([read.pop(path)[0] for path in doubts]), TEMPLATES)
         help = f"{better}{better and '; '}--frame auto looks for another part, --force draws all"
-    refused |= {str(path): doubt for path, doubt in doubts.items()}
+    refused |= doubts
     if doubts and needed and not read:
         path, doubt = next(iter(doubts.items()))
         raise ValueError(f"{path}: {doubt}; {help}")
@@ -188,7 +180,7 @@ def write_images(
                     record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
                     (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
             except (ValueError, OSError) as problem:
-                refused[str(path)] = " ".join(str(problem).split())
+                refused[path] = " ".join(str(problem).split())
             else:
                 records.append(record)
         if refused and not records and not done:
@@ -201,8 +193,8 @@ def write_images(
                 drawn.save(temporary, format="PNG")
         shutil.rmtree(kept, ignore_errors=True)
     every = [*images, *beside]
-    percentiles = {str(one.path): one.percentile for one in every if one.percentile is not None}
-    framing = {str(one.path): one.framing for one in every}
+    percentiles = {one.path: one.percentile for one in every if one.percentile is not None}
+    framing = {one.path: one.framing for one in every}
     odd = ""
     if percentiles:
         odd = unlike(np.stack([one.pixels for one in every]), [one.percentile or 0 for one in every])

@@ -197,17 +197,17 @@ def image_files(paths: Sequence[Path], out: Path) -> list[Path]:
 def readable(
     paths: Sequence[Path], read: Callable[[Path], T], progress: Callable[..., object] | None = None,
     needed: bool = True,
-) -> tuple[dict[Path, T], dict[str, str]]:  # fmt: skip
+) -> tuple[dict[Path, T], dict[Path, str]]:  # fmt: skip
     """Every file that can be read, and why the others cannot; none is an error where one is ``needed``."""
     result: dict[Path, T] = {}
-    refused: dict[str, str] = {}
+    refused: dict[Path, str] = {}
     for number, path in enumerate(paths):
         if progress is not None:
             progress(number, len(paths), description="reading")
         try:
             result[path] = read(path)
         except (ValueError, OSError) as problem:
-            refused[str(path)] = " ".join(str(problem).split())
+            refused[path] = " ".join(str(problem).split())
     if needed and refused and not result:
         raise ValueError(next(iter(refused.values())))
     return result, refused
