@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from derender.baselines.controls import untrained_twin
-from derender.features.extract import as_batch
+from derender.features.extract import as_batch, factor_codes
 from derender.interpretation import attribution, tables
 from derender.interpretation.explanation import Explained
 from derender.interpretation.probe import Probe
@@ -57,7 +57,7 @@ def saliency_sheet(
 ) -> Image.Image:
     """One row for each image: the input and its answer, then each factor's map and share of |IG|."""
     with torch.no_grad():
-        features = {name: code.float().cpu().numpy() for name, code in model.embed(images).items()}
+        features = factor_codes(model, images)
     gradients, _ = attribution.integrated_gradients(probe, probe.columns(features), target)
     shares, answers = attribution.factor_shares(gradients, probe), probe.probabilities(features)[:, target]
     targets = [target] * len(images)

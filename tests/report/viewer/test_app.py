@@ -235,7 +235,7 @@ def test_further_factors_move_and_swap(renderer):
         assert Light.of(studio.scene(lit).light[0]).model_dump() == two["light"]
         return
     assert about["light"] and [one["name"] for one in about["numbers"]["haze"]] == ["beta", "airlight"]
-    assert studio.settings(asked)["numbers"] == one["numbers"]
+    assert json.loads(studio.settings(asked))["numbers"] == one["numbers"]
     moved = asked.model_copy(update={"numbers": {**one["numbers"], "haze": [4.0, 1.0]}, "detail": "model"})
     own = asked.model_copy(update={"detail": "model"})
     change = np.asarray(studio._drawn(moved)).astype(float) - np.asarray(studio._drawn(own))

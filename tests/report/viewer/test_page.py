@@ -8,16 +8,14 @@ from tests.report.test_page import Elements
 
 from derender.report.viewer.app import PAGE_FILES
 
-PAGE = {
-    name: (files("derender.report.viewer") / "page" / name).read_text() for name, _ in PAGE_FILES.values()
-}
+PAGE = {name: (files("derender.report.viewer") / "page" / name).read_text() for name in PAGE_FILES}
 
 
 def test_every_file_of_the_page_is_served(client):
-    for path, (name, kind) in PAGE_FILES.items():
-        reply = client.get(path)
+    for name, kind in PAGE_FILES.items():
+        reply = client.get(f"/{name}".removesuffix("index.html"))
         assert reply.body.decode() == PAGE[name]
-        assert reply.headers["content-type"].startswith(kind)
+        assert reply.headers["content-type"].startswith(f"text/{kind}")
 
 
 @pytest.mark.parametrize("name", PAGE)

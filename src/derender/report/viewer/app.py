@@ -55,12 +55,7 @@ MEDIA_TYPES = {
     b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg", b"GIF8": "image/gif", b"glTF": "model/gltf-binary",
     b"PK": "application/zip", b"{": "application/json",
 }  # fmt: skip
-PAGE_FILES = {
-    "/": ("index.html", "text/html"),
-    "/view.css": ("view.css", "text/css"),
-    "/view.js": ("view.js", "text/javascript"),
-    "/surface.js": ("surface.js", "text/javascript"),
-}
+PAGE_FILES = {"index.html": "html", "view.css": "css", "view.js": "javascript", "surface.js": "javascript"}
 
 
 def open_viewer(
@@ -106,9 +101,6 @@ def open_viewer(
     return studio, notes
 
 
-Answer = Callable[[Request], Awaitable[Response]]
-
-
 class Application:
     """The answers, and the threads that work them out; an ASGI application as ``guarded``.
 
@@ -126,24 +118,22 @@ class Application:
         self.body_seconds, self.work_seconds = body_seconds, work_seconds
         self._computing = ThreadPoolExecutor(1, thread_name_prefix="view-compute")
         self._decoding = ThreadPoolExecutor(1, thread_name_prefix="view-decode")
-        posts: dict[str, Answer] = {
+        posts: dict[str, Callable[[Request], Awaitable[Response]]] = {
             "/api/pictures": self.open_upload,
             "/api/examples/{number:int}": self.open_example,
             "/api/rows/{number:int}": self.open_row,
-            "/api/factors": partial(self.made, studio.factors, ViewRequest),
             "/api/neighbours": self.neighbours,
             "/api/crop": partial(self.made, studio.again, CropRequest, patience=LONG_WORK),
             "/api/film": partial(self.made, studio.film, FilmRequest, patience=LONG_WORK),
-            "/api/settings": partial(self.made, studio.settings_file, ViewRequest),
         }
-        makers = ("view", "before", "preview", "picture", "panel", "mesh", "archive")
+        makers = ("view", "before", "preview", "picture", "panel", "mesh", "archive", "factors", "settings")
         posts |= {f"/api/{name}": partial(self.made, getattr(studio, name), ViewRequest) for name in makers}
-        gets: dict[str, Answer] = {"/api/about": self.about}
-        for path, (name, media_type) in PAGE_FILES.items():
-            content = (files("derender.report.viewer") / "page" / name).read_bytes()
-            gets[path] = partial(_page_file, content, media_type)
         routes = [Route(path, answer, methods=["POST"]) for path, answer in posts.items()]
-        routes += [Route(path, answer, methods=["GET"]) for path, answer in gets.items()]
+        routes.append(Route("/api/about", self.about, methods=["GET"]))
+        for name, kind in PAGE_FILES.items():
+            content = (files("derender.report.viewer") / "page" / name).read_bytes()
+            page = Response(content, media_type=f"text/{kind}")
+            routes.append(Route("/" if kind == "html" else f"/{name}", page, methods=["GET"]))
         handled = (HTTPException, Refused, ValueError, ClientDisconnect)
         handlers: dict[Any, Any] = dict.fromkeys(handled, _problem)
         self.guarded = Guard(Starlette(routes=routes, exception_handlers=handlers), host)
@@ -231,10 +221,6 @@ class Application:
         if received > limit:
             raise too_large() if limit == BODY_LIMIT_BYTES else Refused(413, "this request is too long")
         return bytes(content)
-
-
-async def _page_file(content: bytes, media_type: str, request: Request) -> Response:
-    return Response(content, media_type=media_type)
 
 
 async def _problem(request: Request, problem: Exception) -> Response:

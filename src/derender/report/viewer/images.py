@@ -165,13 +165,12 @@ class Gallery:
         file = self.table.files[row]
         if self._listed is None or file not in self._position:
             raise Refused(404, "the image of this row is not here: name its place with --data")
-        boxes = self._listed.table.boxes
-        box = None if boxes is None else boxes[self._position[file]]
+        sample = next(self._listed.samples(self._position[file]))
         try:
-            encoded = self._listed.files.read(file)
+            encoded = sample.read()
         except (ValueError, OSError) as problem:
             raise Refused(404, "the image of this row can no longer be read") from problem
-        return pixels_of(encoded, size, box, self._listed.fit)
+        return pixels_of(encoded, size, sample.box, sample.fit)
 
     def close(self) -> None:
         if self._listed is not None:

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL.Image import DecompressionBombError
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from torch import Tensor
 
 from derender.data import Unreadable, decode, decode_whole, quiet_pillow
+from derender.settings import Settings
 
 LARGEST_SIZE = 1024
 BODY_LIMIT_BYTES = 20_000_000
@@ -41,13 +42,7 @@ class Refused(Exception):
         self.message = message
 
 
-class Checked(BaseModel):
-    """Values of a request: of the stated types, finite, and no others."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
-
-
-class Light(Checked):
+class Light(Settings):
     """Ambient and diffuse strength, pitch and yaw in degrees (conventions.md)."""
 
     ambient: Strength
@@ -66,7 +61,7 @@ class Light(Checked):
         return torch.tensor([[self.ambient, self.diffuse, radians(self.pitch_deg), radians(self.yaw_deg)]])
 
 
-class Camera(Checked):
+class Camera(Settings):
     """Rotation about x, y, z in degrees and translation in scene units (conventions.md)."""
 
     rotation_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)]
@@ -86,15 +81,16 @@ def _degrees(angles: Float[Tensor, " k"]) -> list[float]:
     return [min(max(degrees(one), -STEEPEST_DEG), STEEPEST_DEG) for one in angles.nan_to_num().tolist()]
 
 
-class ViewRequest(Checked):
+class ViewRequest(Settings):
     """An image as it is to be shown."""
 
     picture: ImageId  # the name it got when it was opened
     # other opened images that give their geometry, albedo or light
-    swaps: dict[Literal["geometry", "albedo", "light"], ImageId] = {}
+    swaps: dict[Literal["geometry", "albedo", "light"], ImageId] = Field(default_factory=dict)
     light: Light | None = None  # instead of the image's own
     camera: Camera | None = None  # instead of the image's own
-    numbers: dict[str, list[float]] = {}  # of the renderer's further factors, instead of the image's own
+    # of the renderer's further factors, instead of the image's own
+    numbers: dict[str, list[float]] = Field(default_factory=dict)
     # longer side in pixels; the model's own if left out, and never less
     size: Annotated[int, Field(ge=8, le=LARGEST_SIZE)] | None = None
     detail: Literal["photo", "model"] = "photo"  # whose pixels are drawn, the photograph's or the model's
@@ -108,7 +104,7 @@ class FilmRequest(ViewRequest):
     move: Literal["light", "camera"]
 
 
-class Place(Checked):
+class Place(Settings):
     """A square in the photograph: its centre and side in pixels, its clockwise turn in degrees."""
 
     x: Annotated[float, Field(ge=0, le=PIXEL_LIMIT)]
@@ -117,7 +113,7 @@ class Place(Checked):
     roll_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
 
 
-class CropRequest(Checked):
+class CropRequest(Settings):
     """An opened image to be decomposed again, with its scene optimised against it or not.
 
     ``crop`` is the part that the model is given, or how it is found; the same as before if left out.
@@ -135,13 +131,13 @@ class NeighbourRequest(ViewRequest):
     k: Annotated[int, Field(ge=1, le=48)] = 12
 
 
-Question = TypeVar("Question", bound=Checked)
+Question = TypeVar("Question", bound=Settings)
 
 
 def read_request(kind: type[Question], body: bytes) -> Question:
-    """The question in a request's body; anything else is refused with its first mistake."""
+    """The question in a request's body, of the stated types; anything else is refused: its first mistake."""
     try:
-        return kind.model_validate_json(body)
+        return kind.model_validate_json(body, strict=True)
     except ValidationError as problem:
         first = problem.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"])) or "the request"

@@ -23,6 +23,7 @@ from PIL import Image
 from derender import __version__
 from derender.data import as_float
 from derender.features import named
+from derender.features.extract import factor_codes
 from derender.features.neighbours import nearest, same_image
 from derender.model import Derenderer
 from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
@@ -153,17 +154,16 @@ class Studio:
             pixels = frame.cut(photo, self.model.image_size)
         with torch.inference_mode():
             images = as_float(pixels[None]).to(self.model.device)
-            features = self.model.embed(images)
+            features = {name: rows[0] for name, rows in factor_codes(self.model, images).items()}
             errors = reconstruction_errors(self.model, pixels[None])
             if fit_steps:
                 scene = self.model.fit_scenes(images, fit_steps).scene
                 l1 = float(masked_l1(self.model.render(scene), images)[0])
             else:
                 scene, l1 = self.model.decompose(images), float(errors[0])
-        rows = {name: row[0].float().cpu().numpy() for name, row in features.items()}
         scene = scene.to("cpu")
         percentile = None if self.held_out is None else float(percentile_of(errors, self.held_out)[0])
-        opened = ShownImage(photo, faces, frame, framed, pixels, scene, rows)
+        opened = ShownImage(photo, faces, frame, framed, pixels, scene, features)
         return {
             "picture": self.shelf.put(opened),
             "light": Light.of(scene.light[0]).model_dump(),
@@ -259,7 +259,7 @@ class Studio:
         files = {f"{name}.png": image_bytes(image) for name, image in self.maps(question).items()}
         files |= {"panel.png": self.panel(question), "view.png": self.picture(question)}
         files["surface.glb"] = self.mesh(question)
-        files["settings.json"] = self.settings_file(question)
+        files["settings.json"] = self.settings(question)
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in files.items():
@@ -278,10 +278,10 @@ class Studio:
                 texture = PhotoDetail(pixels, opened.scene, fov_deg, renderer=renderer).albedo()
         return model_mesh(self.model, scene, texture=texture).files("surface")["surface.glb"]
 
-    def settings(self, question: ViewRequest) -> dict[str, Any]:
-        """Light and camera in numbers, and how the image was made."""
+    def settings(self, question: ViewRequest) -> bytes:
+        """Light and camera in numbers, and how the image was made: a file of JSON."""
         scene = self.scene(question)
-        return {
+        values = {
             "derender": __version__,
             "model": self.name,
             "light": (question.light or Light.of(scene.light[0])).model_dump(),
@@ -290,10 +290,7 @@ class Studio:
             "from_another_picture": sorted(question.swaps),
             "size": self._size(question),
         }
-
-    def settings_file(self, question: ViewRequest) -> bytes:
-        """The same as a file of JSON."""
-        return (json.dumps(self.settings(question), indent=1) + "\n").encode()
+        return (json.dumps(values, indent=1) + "\n").encode()
 
     def neighbours(self, question: NeighbourRequest) -> list[tuple[int, float]]:
         """Rows nearest by one factor of the image that gives it, and distances; without that image itself."""
