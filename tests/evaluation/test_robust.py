@@ -11,12 +11,12 @@ from derender import Derenderer
 from derender.data import ImageSet
 from derender.evaluation import trials
 from derender.evaluation.linear_task import task_of
-from derender.evaluation.memory import Memory
+from derender.evaluation.options import Options
 from derender.evaluation.robust import area_under, compare_robustness
 from derender.evaluation.trials import Curve, Recipe, Trial, chosen_axes
 from derender.render import render_scene
 
-YAW, LIGHT = chosen_axes(["yaw", "light"])
+(YAW, LIGHT), FRESH = chosen_axes(["yaw", "light"]), Options(cache="none")
 
 
 def test_generated_faces_stay_the_same_while_one_angle_is_held():
@@ -39,13 +39,13 @@ def test_generated_faces_stay_the_same_while_one_angle_is_held():
 
 def test_a_generated_trial_is_made_once(tmp_path):
     recipe = Recipe(people=3, learned=3, tested=2, image_size=16)
-    trial = trials.generated_trial(recipe, (YAW, LIGHT), (0, 30), memory=Memory(tmp_path))
+    trial = trials.generated_trial(recipe, (YAW, LIGHT), (0, 30), Options(cache=tmp_path))
     yaw, light = trial.curves
     assert len(trial.images) == 9 + 6 + 2 * (6 + 12)  # 30 degrees to either side
     assert [len(rows) for rows in (*yaw.points, *light.points[1:])] == [6, 6, 12, 6, 12]
-    memory = Memory(tmp_path)
-    again = trials.generated_trial(replace(recipe), (YAW, LIGHT), (0, 30), memory=memory)
-    assert memory.recalled == 1 and np.array_equal(again.images, trial.images)
+    how = Options(cache=tmp_path)
+    again = trials.generated_trial(replace(recipe), (YAW, LIGHT), (0, 30), how)
+    assert how.memory.recalled == 1 and np.array_equal(again.images, trial.images)
     expected = recipe.generate("tested", axis=LIGHT, angle=30.0)
     assert np.array_equal(trial.images[light.points[2][6:]], expected.images)
     assert trial.task.targets[light.points[2][6:]].argmax(1).tolist() == (
@@ -56,7 +56,7 @@ def test_a_generated_trial_is_made_once(tmp_path):
 
 def test_nobody_is_asked_what_nobody_could_learn():
     recipe = Recipe("cars", "class", people=16, learned=1, tested=1, image_size=16)
-    trial = trials.generated_trial(recipe, [LIGHT], (0, 20))
+    trial = trials.generated_trial(recipe, [LIGHT], (0, 20), FRESH)
     (curve,) = trial.curves
     counted = np.bincount(trial.task.targets[curve.learn].argmax(1), minlength=len(trial.task.names))
     asked = trial.task.targets[np.concatenate(curve.points)].argmax(1)
@@ -76,7 +76,7 @@ def test_a_rendered_trial_changes_the_angle_alone():
     pictures = ImageSet(images, tuple("abcdefgh"))
     task = task_of({"who": np.array(list("xyxyxyxy"))})
     learn, test = np.arange(6), np.array([6, 7])
-    trial = trials.rendered_trial(model, pictures, task, learn, test, (YAW, LIGHT), (0, 40))
+    trial = trials.rendered_trial(model, pictures, task, learn, test, (YAW, LIGHT), (0, 40), FRESH)
     plain, *turned = scenes
     assert len(trial.images) == 8 + 2 * (2 + 4) and trial.curves[0].learn.tolist() == [0, 1, 2, 3, 4, 5]
     with torch.inference_mode():
@@ -91,7 +91,7 @@ def test_a_rendered_trial_changes_the_angle_alone():
         assert torch.allclose(turned[at].camera, own.camera)
     assert trial.task.targets[trial.curves[1].points[2]].ravel().tolist() == [0, 1, 0, 1]
     groups = np.array(["a", "a", "b", "b", "", "", "", "c"])  # the fifth is learned from, the seventh tested
-    apart = trials.rendered_trial(model, pictures, task, learn, test, (YAW,), (0, 40), groups=groups)
+    apart = trials.rendered_trial(model, pictures, task, learn, test, (YAW,), (0, 40), FRESH, groups)
     assert apart.unit[0] == apart.unit[1] != apart.unit[2] and len(set(apart.unit[:8].tolist())) == 6
 
 
@@ -125,9 +125,9 @@ def test_bad_words_are_refused():
         trials.checked_levels((30, 0), [YAW])
     few = Recipe(people=2, learned=1, tested=1, image_size=16)
     with pytest.raises(ValueError, match="label of generated faces 'expresion'; did you mean 'expression'"):
-        trials.generated_trial(replace(few, label="expresion"), [YAW], (0, 9))
+        trials.generated_trial(replace(few, label="expresion"), [YAW], (0, 9), FRESH)
     with pytest.raises(ValueError, match="fewer than two values of 'identity' have two images"):
-        trials.generated_trial(few, [YAW], (0, 9))
+        trials.generated_trial(few, [YAW], (0, 9), FRESH)
 
 
 PEOPLE, EACH = 4, 10

@@ -11,6 +11,7 @@ the image alone and averaged with those of its mirror image: whitened features s
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -19,12 +20,11 @@ import numpy as np
 from derender.baselines import load_baseline
 from derender.baselines.controls import control_table, descriptor_features, pca_features, pixel_features
 from derender.data import ImageSet
-from derender.evaluation.memory import Memory
 from derender.evaluation.options import DEFAULT_FACTORS, Options
 from derender.evaluation.pixels import component_count
 from derender.features import FeatureTable, embed_images, missing, table_labels
 from derender.features.extract import model_facts
-from derender.inputs import Progress, as_model, device_named
+from derender.inputs import as_model, device_named
 from derender.model import Derenderer
 from derender.presets import ModelSettings
 from derender.storage.bounded import first_line
@@ -39,9 +39,7 @@ DESCRIPTORS_SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP
 
 @dataclass(frozen=True)
 class FeatureRow:
-    """One kind of feature: a table for each run, the factors to use side by side (None means all), and
-    whether it is a control, which learned nothing.
-    """
+    """One kind of feature: a table for each run, factors to use (None: all); a control learned nothing."""
 
     name: str
     tables: tuple[FeatureTable, ...]
@@ -92,8 +90,7 @@ def row_of(name: str, runs: FeatureSource | Sequence[FeatureSource], options: Op
             raise ValueError(f"model {name!r} needs images to embed: give images")
         else:
             model = opened(run, options.device)
-            progress = options.stage(f"embedding {name}")
-            tables.append(embedded_table(model, options.at(model.image_size), options.memory, progress))
+            tables.append(embedded_table(model, options.at(model.image_size), options, f"embedding {name}"))
     chosen = options.chosen
     if chosen is not None and not set(chosen) & set(tables[0].factors):
         chosen = None
@@ -121,15 +118,12 @@ def runs_of(runs: FeatureSource | Sequence[FeatureSource]) -> list[FeatureSource
     return [runs] if isinstance(runs, FeatureTable | Derenderer | str | Path) else list(runs)
 
 
-def embedded_table(
-    model: Any, images: ImageSet, memory: Memory, progress: Progress | None = None
-) -> FeatureTable:
+def embedded_table(model: Any, images: ImageSet, options: Options, stage: str = "embedding") -> FeatureTable:
     """A model's features of images, cached by the content of both; names and labels are the images'."""
     origin = model_facts(model, images.source, images.layout)
     inputs = {"weights": origin["weights"], "images": images.images}
-    factors = memory.recall(
-        "embedding", inputs, lambda: embed_images(model, images.images, progress=progress)
-    )
+    make = partial(embed_images, model, images.images, progress=options.stage(stage))
+    factors = options.memory.recall("embedding", inputs, make)
     return FeatureTable(images.files, factors, table_labels(images), origin)
 
 
@@ -306,7 +300,7 @@ def control_rows(
     if settings is not None:
         for seed in options.seeds(options.untrained_seeds):
             encoder = Derenderer.seeded(settings, seed).to(device_named(options.device)).eval()
-            table = embedded_table(encoder, images, options.memory, options.stage(f"{UNTRAINED} {seed}"))
+            table = embedded_table(encoder, images, options, f"{UNTRAINED} {seed}")
             tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
         rows.append(FeatureRow(UNTRAINED, tuple(tables), options.chosen, control=True))
     fitted = images if fit_on is None else fit_on
@@ -316,11 +310,9 @@ def control_rows(
     pca = options.memory.recall_one(
         "pca", inputs, lambda: pca_features(images, components=components, fit_on=fitted).factors["pca"]
     )
-    table = control_table(images, "pca", pca, {"components": components})
-    rows.append(FeatureRow(f"PCA ({components})", (table,), control=True))
-    options.notes.append(
-        f"PCA ({components}), whitened, is fitted to {len(fitted):,} images of {fitted.source}"
-    )
+    table, name = control_table(images, "pca", pca, {"components": components}), f"PCA ({components})"
+    rows.append(FeatureRow(name, (table,), control=True))
+    options.notes.append(f"{name}, whitened, is fitted to {len(fitted):,} images of {fitted.source}")
     rows.append(FeatureRow("pixels", (pixel_features(images),), control=True))
     for name, shown in DESCRIPTORS_SHOWN.items() if options.descriptors else ():
         try:

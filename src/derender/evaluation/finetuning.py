@@ -273,8 +273,9 @@ def score_finetuned(
     parts = (learned_and_tested, target.split.train)
     shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
     models, factors = {"frozen": start, UNTRAINED: untrained_twin(start, seed)}, task.config.target.factors
-    runs = {name: [embedded_table(one, shown, kept).concatenate(factors)] for name, one in models.items()}
-    plain = control_rows(shown, None, Options(cache=kept), fit_on=fitted)  # which learned nothing
+    again = Options(cache=kept)
+    runs = {name: [embedded_table(one, shown, again).concatenate(factors)] for name, one in models.items()}
+    plain = control_rows(shown, None, again, fit_on=fitted)  # which learned nothing
     runs |= {row.name: row.arrays() for row in plain}
     asked = target.asked.select(learned_and_tested)
     rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})

@@ -20,15 +20,7 @@ from derender.evaluation.linear_probes import PROBES, majority_answers, probe_ru
 from derender.evaluation.linear_task import count_scores, divide_rows, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import (
-    Column,
-    Row,
-    Scores,
-    ScoreTable,
-    scored_table,
-    verdict,
-    verdict_table,
-)
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, judged_tables, verdict
 from derender.evaluation.trials import LEVELS, Curve, Trial
 from derender.features import FeatureTable, named, table_labels
 from derender.inputs import Progress, as_model
@@ -105,9 +97,7 @@ def robustness(
     if generated:
         name = names[0] if names else trials.LABELS[way]
         recipe = trials.Recipe(way, name, people, learned, tested, first.image_size, how.seed)
-        trial = trials.generated_trial(
-            recipe, turned, levels, memory=how.memory, progress=how.stage("generating")
-        )
+        trial = trials.generated_trial(recipe, turned, levels, how)
     else:
         read = how.at(first.image_size)
         columns = FeatureTable(read.files, {"none": np.zeros((len(read), 1))}, table_labels(read))
@@ -123,13 +113,10 @@ def robustness(
             trial = trials.true_angle_trial(read, task, turned)
         else:
             parts = divide_rows(task, **ready.split, test_fraction=test_fraction, groups=side)
-            progress = how.stage("re-rendering")
-            trial = trials.rendered_trial(
-                first, read, task, *parts, turned, levels, groups=side, memory=how.memory, progress=progress
-            )
+            trial = trials.rendered_trial(first, read, task, *parts, turned, levels, how, side)
     rows = []
     for name, net in nets.items():
-        table = feature_rows.embedded_table(net, trial.pictures, how.memory, how.stage(f"embedding {name}"))
+        table = feature_rows.embedded_table(net, trial.pictures, how, f"embedding {name}")
         joined, prefix = " + ".join(how.chosen or table.factors), f"{name}: " if len(nets) > 1 else ""
         rows.append(feature_rows.FeatureRow(f"{prefix}{joined}", (table,), how.chosen))
         if len(rows) == 1:
@@ -201,16 +188,15 @@ class RobustnessComparison:
         for curve in self.curves:
             rows, last = curve.rows[score], curve.levels[-1]
             at_last = Column(f"at {last:.0f} deg", "high", note="the curve's last point")
-            lost = {_LOST: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value}
-            columns = {AREA: _AREA, ORDINARY: _ORDINARY, level_name(last): at_last}
+            more = {at_last: lambda row, last=last: row.scores[level_name(last)].value}
+            more |= {_LOST: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value}
             angles = [Column(f"{level:.0f}", "high") for level in curve.levels]
             points = [Row(row.name, curve.values(row), row.control) for row in rows]
-            judged = {AREA: Column("area"), ORDINARY: Column("ordinary")}
-            tables += [
-                scored_table(self._caption(curve, score), "features", rows, columns, more=lost),
-                ScoreTable(f"{curve.title} in degrees: {SCORES[score]}", "features", angles, points),
-                verdict_table(rows, judged, f"{curve.title}: above the strongest control?"),
-            ]
+            caption, asked = self._caption(curve, score), f"{curve.title}: above the strongest control?"
+            columns = {AREA: _AREA, ORDINARY: _ORDINARY}
+            areas, judged = judged_tables(caption, "features", rows, columns, asked, more=more)
+            levels = ScoreTable(f"{curve.title} in degrees: {SCORES[score]}", "features", angles, points)
+            tables += [areas, levels, judged]
         return tables
 
     def _caption(self, curve: CurveResult, score: str) -> str:

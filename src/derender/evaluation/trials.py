@@ -28,8 +28,8 @@ from jaxtyping import Int64, UInt8
 from derender.data import ImageSet
 from derender.data.synthetic import KINDS, SyntheticSet
 from derender.evaluation.linear_task import Task, task_of
-from derender.evaluation.memory import Memory
-from derender.features import Progress, chosen, map_batches, missing, model_fingerprint, named
+from derender.evaluation.options import Options
+from derender.features import chosen, map_batches, missing, model_fingerprint, named
 from derender.scene import Scene
 from derender.training.step import fill_uncovered
 
@@ -58,11 +58,6 @@ class Axis:
     cleared: int | None = None
     held: str | None = None
     most_deg: float = 85.0
-
-    def fixed(self, kind: str, angle_deg: float) -> dict[str, tuple[float, float]]:
-        """Ranges of a generator's settings that hold the angle fixed."""
-        result = {self.settings[kind]: (angle_deg, angle_deg)}
-        return result if self.held is None else {**result, self.held: (0.0, 0.0)}
 
     def rotated(self, scene: Scene, angle_deg: float) -> Scene:
         """The scenes at this angle instead of their own; sign as in docs/reference/conventions.md."""
@@ -249,21 +244,15 @@ class Recipe:
         if part == "learned":  # of another label than identity other people are tested
             fixed[f"first_{one}"] = start + (self.people if self.label != "identity" else 0)
         if axis is not None:
+            ranges = {axis.settings[self.kind]: (angle, angle), axis.held: (0.0, 0.0)}
             usual = getattr(settings(), axis.part).model_dump()
-            fixed[axis.part] = {**usual, **axis.fixed(self.kind, angle)}
+            fixed[axis.part] = usual | {name: ends for name, ends in ranges.items() if name is not None}
         first = 0 if part == "learned" else start * self.tested
         number = self.people * each if count is None else count
         return generate(number, self.image_size, self.seed, settings(**fixed), first=first)
 
 
-def generated_trial(
-    recipe: Recipe,
-    axes: Sequence[Axis],
-    levels: tuple[float, ...],
-    *,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
-) -> Trial:
+def generated_trial(recipe: Recipe, axes: Sequence[Axis], levels: tuple[float, ...], how: Options) -> Trial:
     """Generate the images, or find them in the cache."""
     sample = recipe.generate("tested", 1)
     named({"identity": sample.identity, **sample.labels}, recipe.label, f"label of generated {recipe.kind}")
@@ -280,14 +269,14 @@ def generated_trial(
             images.append(made.images)
             result[part] = {"identity": made.identity, **made.labels}[recipe.label]
             result[f"who_{part}"] = made.identity
-        total = sum(map(len, images)) + len(asked) * len(images[1])
+        total, progress = sum(map(len, images)) + len(asked) * len(images[1]), how.stage("generating")
         for axis, angle in asked:
             images.append(recipe.generate("tested", axis=axis, angle=angle).images)
             if progress is not None:
                 progress(sum(map(len, images)), total)
         return {"images": np.concatenate(images), **result}
 
-    result = (memory or Memory()).recall("generated", inputs, make)
+    result = how.memory.recall("generated", inputs, make)
     n_learn, values = len(result["learned"]), np.concatenate((result["learned"], result["tested"]))
     if values.dtype.kind == "f":
         values = np.where(values > np.median(result["learned"]), "above", "below")
@@ -303,9 +292,9 @@ def generated_trial(
     if recipe.label != "identity":
         people = np.concatenate((result["who_learned"], result["who_tested"]))
         unit = np.unique(people, return_inverse=True)[1]
-    how, dropped = f"{recipe.label} of generated {recipe.kind}", int(missing(values).sum())
-    task = task_of({recipe.label: values})
-    return stacked_trial(result["images"], task, unit, n_learn, axes, levels, how, dropped)
+    source, task = f"{recipe.label} of generated {recipe.kind}", task_of({recipe.label: values})
+    dropped = int((~task.known).sum())
+    return stacked_trial(result["images"], task, unit, n_learn, axes, levels, source, dropped)
 
 
 def rendered_trial(
@@ -316,10 +305,8 @@ def rendered_trial(
     test: np.ndarray,
     axes: Sequence[Axis],
     levels: tuple[float, ...],
-    *,
+    how: Options,
     groups: np.ndarray | None = None,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
 ) -> Trial:
     """Re-render images at the model's size, or find them in the cache.
 
@@ -341,18 +328,19 @@ def rendered_trial(
                 result.append((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
             return result
 
+        progress = how.stage("re-rendering")
         parts = map_batches(render, model, pictures.images[rows], batch_size=64, progress=progress)
         return [np.concatenate(part) for part in zip(*parts, strict=True)]
 
-    images = (memory or Memory()).recall_one(
+    images = how.memory.recall_one(
         "rendered", inputs, lambda: np.concatenate((*rendered(rows, [None]), *rendered(test, asked)))
     )
     number = np.arange(len(pictures))
     if groups is not None:  # an image without a group stands alone
         group = np.unique(groups.astype(str), return_inverse=True)[1]
         number = np.where(missing(groups), len(groups) + number, group)
-    how, dropped = f"images of {pictures.layout} re-rendered", int((~task.known).sum())
-    return stacked_trial(images, task.select(rows), number[rows], len(learn), axes, levels, how, dropped)
+    source, dropped = f"images of {pictures.layout} re-rendered", int((~task.known).sum())
+    return stacked_trial(images, task.select(rows), number[rows], len(learn), axes, levels, source, dropped)
 
 
 def true_angle_trial(pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = 3) -> Trial:
