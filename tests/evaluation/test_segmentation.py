@@ -11,7 +11,7 @@ from torchmetrics.functional.classification import multiclass_accuracy, multicla
 
 from derender import Derenderer
 from derender.data import ImageSet
-from derender.evaluation import segmenters
+from derender.evaluation import bootstrap, segmenters
 from derender.evaluation.memory import Memory
 from derender.evaluation.segmentation import COLUMNS, class_iou, count_pixels, resampled_scores, segment
 from derender.evaluation.segmenters import (
@@ -134,7 +134,7 @@ def test_a_comparison_goes_on_where_it_stopped(data, model, tmp_path, before):
     assert told[-1][:2] == (4 * len(data.train),) * 2
     again = segment(model, data, memory=Memory(tmp_path), **options).result
     for one, two in zip(result.rows, again.rows, strict=True):
-        assert str(one.scored.numbers()["scores"]) == str(two.scored.numbers()["scores"])
+        assert str(bootstrap.numbers_of([one.scored])) == str(bootstrap.numbers_of([two.scored]))
         assert (one.shown == two.shown).all() and (one.losses == two.losses).all()
     names = [row.scored.name for row in result.rows]
     assert names[:2] == ["albedo encoder", "random start"] and "each place's class" in names

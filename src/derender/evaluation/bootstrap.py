@@ -59,18 +59,18 @@ class ScoredRow:
     scores: Mapping[str, Estimate]
     versus: Mapping[str, Difference] = field(default_factory=dict)
 
-    def numbers(self) -> dict[str, Any]:
-        """Everything but the resamples, as JSON takes it."""
-        scores = {
-            name: {"value": one.value, "low": one.low, "high": one.high, "spread": one.deviation}
-            for name, one in self.scores.items()
-        }
-        return {"control": self.control, "runs": self.runs, "scores": scores, "versus": dict(self.versus)}
-
 
 def numbers_of(rows: Iterable[ScoredRow]) -> dict[str, dict[str, Any]]:
     """Everything but the resamples by the names of the rows, as JSON takes it."""
-    return {row.name: row.numbers() for row in rows}
+    result = {}
+    for row in rows:
+        scores = {
+            name: {"value": one.value, "low": one.low, "high": one.high, "spread": one.deviation}
+            for name, one in row.scores.items()
+        }
+        own = {"control": row.control, "runs": row.runs, "scores": scores, "versus": dict(row.versus)}
+        result[row.name] = own
+    return result
 
 
 def resamples(n_rows: int, count: int = RESAMPLES, seed: int = 0) -> Iterator[np.ndarray]:

@@ -114,10 +114,6 @@ class LinearPart:
     count: int
     rows: tuple[bootstrap.ScoredRow, ...]
 
-    def numbers(self) -> dict[str, Any]:
-        """Everything as JSON takes it."""
-        return {"head": self.head, "labels": self.count, "rows": bootstrap.numbers_of(self.rows)}
-
 
 @dataclass(frozen=True)
 class LinearComparison:
@@ -136,7 +132,11 @@ class LinearComparison:
 
     def numbers(self) -> dict[str, Any]:
         """Everything as JSON takes it."""
-        return {**vars(self), "parts": [part.numbers() for part in self.parts]}
+        parts = [
+            {"head": part.head, "labels": part.count, "rows": bootstrap.numbers_of(part.rows)}
+            for part in self.parts
+        ]
+        return {**vars(self), "parts": parts}
 
 
 def compare_prepared(
@@ -161,8 +161,8 @@ def compare_prepared(
 
     def learned(model: Any, count: int, at: int, what: str) -> np.ndarray:
         training, images = split.train[count][at], options.at(model.image_size, ready.table.files).images
-        own = [factor.name for factor in model.factors] if isinstance(model, Derenderer) else model.chosen
-        chosen = list((isinstance(model, Derenderer) and options.chosen) or own)
+        ours = isinstance(model, Derenderer)
+        chosen = list(options.chosen or (one.name for one in model.factors)) if ours else list(model.chosen)
         inputs = {
             "weights": model_fingerprint(model), "images": images, "targets": task.targets, "kind": task.kind,
             "rows": training, "tested": split.test, "seed": seeds[at], "factors": chosen,

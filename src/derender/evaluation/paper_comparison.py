@@ -17,7 +17,7 @@ from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
-from derender.evaluation.score_table import Column, Scores, ScoreTable, interval_column, interval_of
+from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, interval_cells, scored_table
 from derender.evaluation.segmentation import SegmentSettings, segment
 from derender.features import named
 
@@ -73,8 +73,7 @@ def compare(
                 raise ValueError(f"two models have the name {name!r}: give each its own")
             result = segment(
                 model, images, masks=masks, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
-                settings=SegmentSettings(epochs=epochs), dataset=how.dataset, limit=how.limit,
-                device=how.device, resamples=how.resamples, cache=how.memory, progress=how.progress,
+                settings=SegmentSettings(epochs=epochs), **{**options, "cache": how.memory},
             )  # fmt: skip
             shown = (result.tables[-1], *result.tables[:-1])
             tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]
@@ -99,9 +98,8 @@ def compare(
     for part in parts:
         columns = part.columns(first)
         if part.labels == (ATTRIBUTES,):
-            columns, left_out = feature_rows.chosen_labels(
-                first, None, True, 2 if spec.kind == "linear" else 1
-            )
+            least = 2 if spec.kind == "linear" else 1
+            columns, left_out = feature_rows.chosen_labels(first, None, True, least)
             notes += left_out
         out = part.left_out(first)
         if out.any():
@@ -122,7 +120,7 @@ def compare(
             result = compare_clusterings(method=method, **same)
             more |= {"n_dropped_before": ready.n_dropped, "differs": part.differs(layout, result.n_rows)}
             shown = {name: CLUSTER_COLUMNS[name] for name in ("accuracy", "f1")}
-            scored = {row.name: row for row in result.rows}
+            scored = list(result.rows)
             if method == "ward":  # the paper's appendix has FINCH beside it
                 try:
                     finch = compare_clusterings(method="finch", **same)
@@ -130,22 +128,18 @@ def compare(
                     notes.append(f"{part.name}: FINCH left out: {error}")
                 else:
                     more["finch"] = finch.numbers()
-                    scored |= {f"{row.name}, FINCH": row for row in finch.rows if row.name in ready.features}
-            ours = {
-                name: {"interval": interval_of(row, "accuracy")} | {s: row.scores[s].value for s in shown}
-                for name, row in scored.items()
-            }
-            shown["interval"] = interval_column(shown["accuracy"])
-            quiet = [name for name, row in scored.items() if row.control]
+                    own = (row for row in finch.rows if row.name in ready.features)
+                    scored += [replace(row, name=f"{row.name}, FINCH") for row in own]
             caption = f"{part.name}, {beside} ({METHODS[method]})"
+            last = {"intervals": (), "deviations": (), "more": interval_cells("accuracy", shown["accuracy"])}
+            ours = scored_table(caption, "features", scored, shown, **last)
             tables += [
-                beside_the_paper(caption, shown, ours, quiet, part.paper, more["differs"]),
+                beside_the_paper(ours, (*shown, "interval"), part.paper, more["differs"]),
                 *clustering_tables(result, f"{part.name}: above the strongest control?"),
             ]
             if ready.n_dropped:
-                notes.append(
-                    f"{part.name}: {ready.n_dropped:,} rows without a label or beyond its sizes left out"
-                )
+                beyond = "rows without a label or beyond its sizes left out"
+                notes.append(f"{part.name}: {ready.n_dropped:,} {beyond}")
         else:
             result = compare_prepared(
                 ready, counts, how.seeds(seeds), how, models=models if finetune else None,
@@ -162,17 +156,19 @@ def heads_table(
     caption: str, result: LinearComparison, paper: Sequence[PaperRow], differs: str
 ) -> ScoreTable:
     """Accuracies of the paper's head by number of labels, frozen and fine-tuned, over the paper's own."""
-    columns, ours, controls = {}, {}, []
+    columns, ours, controls = {}, {}, set()
     for part in result.parts:
         if part.head in ("linear", FINETUNED):
             key, how = f"{part.head} {part.count}", "frozen" if part.head == "linear" else part.head
             columns[key] = Column(f"{part.count:,} {how}", "high")
             for row in part.rows:
                 ours.setdefault(row.name, {})[key] = row.scores["accuracy"].value
-                controls += [row.name] if row.control else []
+                controls |= {row.name} if row.control else set()
     lines: dict[str, dict[str, float]] = {}
     for line in paper:
         lines.setdefault(line.method, {}).update(line.scores)
     asked = {method: scores for method, scores in lines.items() if set(scores) & set(columns)}
     known = [PaperRow(method, paper[0].dataset, scores) for method, scores in asked.items()]
-    return beside_the_paper(caption, columns, ours, controls, known, differs)
+    rows = [Row(name, tuple(map(own.get, columns)), name in controls) for name, own in ours.items()]
+    table = ScoreTable(caption, "features", tuple(columns.values()), rows)
+    return beside_the_paper(table, tuple(columns), known, differs)

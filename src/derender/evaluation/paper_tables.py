@@ -7,7 +7,7 @@ says so. A further table is a further ``TableSpec`` in ``TABLES``; paper_compari
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from derender.evaluation.feature_rows import attribute_columns
-from derender.evaluation.score_table import Cell, Column, Row, ScoreTable
+from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.features import FeatureTable
 
 ATTRIBUTES = "attributes"
@@ -23,9 +23,7 @@ ATTRIBUTES = "attributes"
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One line of the paper: method and data set as it names them, scores (0..1) by the name of our
-    column.
-    """
+    """One line of the paper: method and data set as it names them, scores (0..1) by our columns."""
 
     method: str
     dataset: str
@@ -127,17 +125,12 @@ TABLES = {
 
 
 def beside_the_paper(
-    caption: str,
-    columns: Mapping[str, Column],
-    ours: Mapping[str, Mapping[str, Cell]],
-    controls: Sequence[str],
-    paper: Sequence[PaperRow],
-    differs: str,
-    first: str = "features",
+    ours: ScoreTable, scores: Sequence[str], paper: Sequence[PaperRow], differs: str
 ) -> ScoreTable:
-    """Rows of cells by column over the paper's lines; the last column is the data, or how ours differ."""
-    rows = [Row(name, (*map(cells.get, columns), differs), name in controls) for name, cells in ours.items()]
+    """Our rows over the paper's lines, whose ``scores`` are in the order of our columns; the last column is
+    the data, or how ours differ."""
+    rows = [replace(row, cells=(*row.cells, differs)) for row in ours.rows]
     for line in paper:
-        cells = (*map(line.scores.get, columns), line.dataset)
+        cells = (*map(line.scores.get, scores), line.dataset)
         rows.append(Row(f"paper: {line.method}", cells, note="paper"))
-    return ScoreTable(caption, first, (*columns.values(), Column("data")), rows)
+    return replace(ours, columns=(*ours.columns, Column("data")), rows=rows)

@@ -234,8 +234,7 @@ def scored_table(
     for name, column in columns.items():
         shown[column] = lambda row, name=name, by=column.scale: by * row.scores[name].value
         if name in (main if intervals is None else intervals):
-            between = interval_column(column, over)
-            shown[between] = lambda row, name=name, by=column.scale: interval_of(row, name, by)
+            shown |= interval_cells(name, column, over)
         if name in (main if deviations is None else deviations):
             note = f"standard deviation of {column.name} over seeds"
             spread = Column("±", None, column.digits, note, column.name)
@@ -251,9 +250,15 @@ def interval_column(column: Column, over: str = "scored rows") -> Column:
     return Column("95 %", None, column.digits, note, column.name)
 
 
-def interval_of(row: ScoredRow, score: str, scale: float = 1.0) -> Interval:
-    """The interval of one score, times ``scale``."""
-    return Interval(scale * row.scores[score].low, scale * row.scores[score].high)
+def interval_cells(
+    score: str, column: Column, over: str = "scored rows"
+) -> dict[Column, Callable[[ScoredRow], Cell]]:
+    """The column of a score's interval with a function of the row, as ``scored_table`` takes ``more``."""
+
+    def cell(row: ScoredRow) -> Interval:
+        return Interval(column.scale * row.scores[score].low, column.scale * row.scores[score].high)
+
+    return {interval_column(column, over): cell}
 
 
 VERDICT_COLUMNS = (

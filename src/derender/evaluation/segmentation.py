@@ -19,7 +19,7 @@ import numpy as np
 from derender.data import read_masks
 from derender.data.source import evenly_spaced
 from derender.evaluation import segmenters
-from derender.evaluation.bootstrap import ScoredRow, scored_row, with_verdicts
+from derender.evaluation.bootstrap import ScoredRow, numbers_of, scored_row, with_verdicts
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
@@ -58,9 +58,7 @@ class SegmentationRow:
 
 @dataclass(frozen=True)
 class SegmentationComparison:
-    """Networks in the order requested, the subject of the table first, then controls; ``shown`` are (K,) rows
-    of the data for overlays.
-    """
+    """Networks in the order requested, then controls; ``shown`` are (K,) rows of the data for overlays."""
 
     rows: tuple[SegmentationRow, ...]
     data: SegmentationData
@@ -82,10 +80,10 @@ class SegmentationComparison:
         def by_class(values: np.ndarray) -> dict[str, float]:
             return dict(zip(data.classes, values.tolist(), strict=True))
 
-        rows = {}
+        rows = numbers_of(row.scored for row in self.rows)
         for row in self.rows:
             more = {"trainable": row.trainable, "class_iou": by_class(row.class_iou)}
-            rows[row.scored.name] = {**row.scored.numbers(), **more, "losses": row.losses.tolist()}
+            rows[row.scored.name] |= {**more, "losses": row.losses.tolist()}
         return {
             "n_train": len(data.train), "n_test": len(data.test), "split": data.split, "seeds": self.seeds,
             "settings": self.settings.model_dump(), "train_share": by_class(data.shares(data.train)),
@@ -115,11 +113,9 @@ class SegmentationComparison:
         ]
         heads = (Column("share", note="of the tested pixels"), *columns)
         tables.append(ScoreTable("intersection over union of every class", "class", heads, classes))
-        ours = {one.name: {name: one.scores[name].value for name in COLUMNS} for one in scored}
-        controls = [one.name for one in scored if one.control]
-        caption = "segmentation, beside the paper's Table 3"
-        paper = beside_the_paper(caption, COLUMNS, ours, controls, SEGMENTATION.paper, self.differs, "net")
-        return [*tables, paper]
+        plain: dict[str, Any] = {"intervals": (), "deviations": ()}
+        ours = scored_table("segmentation, beside the paper's Table 3", "net", scored, COLUMNS, **plain)
+        return [*tables, beside_the_paper(ours, tuple(COLUMNS), SEGMENTATION.paper, self.differs)]
 
 
 def segment(
