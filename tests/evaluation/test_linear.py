@@ -16,7 +16,7 @@ from derender import Derenderer
 from derender.baselines.autoencoders import Autoencoder, AutoencoderSettings
 from derender.baselines.supervised import fresh_resnet18
 from derender.evaluation import linear_probes
-from derender.evaluation.linear_probes import HEADS, HeadSettings, logistic_weights, probe, train_heads
+from derender.evaluation.linear_probes import HEADS, HeadSettings, logistic_weights, probe
 from derender.evaluation.linear_probing import compare_linear, finetune
 from derender.evaluation.linear_task import Task, choose_rows, count_scores, linear_scores, task_of
 from derender.evaluation.memory import Memory
@@ -106,7 +106,7 @@ def test_heads_trained_at_once_are_those_trained_one_by_one_in_plain_torch(kind)
     if kind == "labels":
         targets[3, 1] = -1
     rows, tested, seeds = np.stack([np.arange(20), np.arange(10, 30)]), np.arange(40, 60), (4, 5)
-    together = train_heads(features, targets, rows, tested, kind=kind, seeds=seeds, settings=QUICK)
+    together = probe("linear", features, Task(kind, task.names, targets), rows, tested, seeds, settings=QUICK)
     for own, seed, result in zip(rows, seeds, together, strict=True):
         generator, reach = torch.Generator().manual_seed(seed), features.shape[1] ** 0.5
         head = torch.nn.Linear(features.shape[1], targets.shape[1])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import expit, softmax
 
-from derender.evaluation.linear_probes import HeadSettings, logistic_weights, train_heads
+from derender.evaluation.linear_probes import HeadSettings, logistic_weights, probe
 from derender.evaluation.linear_task import task_of
 from derender.interpretation import fit_probe, load_probe, question
 from derender.interpretation.probe import FOLDS, PENALTIES, in_bins
@@ -35,7 +35,7 @@ def test_probes_answer_as_the_projects_own_heads(features, labels, name):
     test = {key: values[tested] for key, values in features.items()}
 
     paper = fit_probe(features, task, rows, head="linear", seed=3, settings=settings)
-    heads = train_heads(x, task.targets, rows[None], tested, kind=task.kind, seeds=[3], settings=settings)
+    heads = probe("linear", x, task, rows[None], tested, [3], settings=settings)
     np.testing.assert_allclose(paper.probabilities(test), heads[0], atol=1e-5)
 
     ours = fit_probe(features, task, rows, seed=3)

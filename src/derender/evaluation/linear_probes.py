@@ -92,10 +92,12 @@ def probe(
         return softmax(logits, axis=1) if kind == "classes" else expit(logits)
 
     def make() -> np.ndarray:
-        if papers:
-            how = {"kind": kind, "seeds": seeds, "settings": settings, "centred": head == "centred"}
-            return train_heads(features, targets, rows, tested, **how)
-        return np.stack(list(map(learned, rows, seeds))).astype(np.float32)
+        if not papers:
+            return np.stack(list(map(learned, rows, seeds))).astype(np.float32)
+        how: dict[str, Any] = {"seeds": seeds, "settings": settings, "centred": head == "centred"}
+        asked = torch.from_numpy(np.ascontiguousarray(features[tested]))
+        heads = zip(*fitted_heads(features, targets, rows, kind=kind, **how), strict=True)
+        return np.stack([probabilities(torch.addmm(b, asked - m, w), kind).numpy() for m, w, b in heads])
 
     return (memory or Memory()).recall_one(f"probe-{head}", inputs, make)
 
@@ -135,15 +137,6 @@ def _shares(targets: np.ndarray) -> np.ndarray:
     return np.divide((targets * known).sum(axis=1), total, out=np.full(total.shape, 0.5), where=total > 0)
 
 
-def train_heads(
-    features: np.ndarray, targets: np.ndarray, rows: np.ndarray, tested: np.ndarray, *, kind: str, **how: Any
-) -> np.ndarray:
-    """Answers of ``fitted_heads``, whose arguments ``how`` has, for the (T,) rows ``tested``: (S, T, A)."""
-    asked = torch.from_numpy(np.ascontiguousarray(features[tested], np.float32))
-    heads = zip(*fitted_heads(features, targets, rows, kind=kind, **how), strict=True)
-    return np.stack([probabilities(torch.addmm(b, asked - m, w), kind).numpy() for m, w, b in heads])
-
-
 def fitted_heads(
     features: np.ndarray,
     targets: np.ndarray,
@@ -165,10 +158,10 @@ def fitted_heads(
     """
     x = torch.from_numpy(np.ascontiguousarray(features, np.float32))
     y = torch.from_numpy(np.asarray(targets, np.float32))
-    generators, chosen = [torch.Generator().manual_seed(seed) for seed in seeds], torch.from_numpy(rows)
+    streams, chosen = [torch.Generator().manual_seed(seed) for seed in seeds], torch.from_numpy(rows)
     weight, bias = (  # uniform in +-1/sqrt(inputs), as torch's linear layer starts
         torch.stack(
-            [(torch.rand(shape, generator=one) * 2 - 1) / x.shape[1] ** 0.5 for one in generators]
+            [(torch.rand(shape, generator=one) * 2 - 1) / x.shape[1] ** 0.5 for one in streams]
         ).requires_grad_()
         for shape in ((x.shape[1], y.shape[1]), (1, y.shape[1]))
     )
@@ -177,9 +170,7 @@ def fitted_heads(
     if centred:
         means = torch.stack([x[own].mean(dim=0, keepdim=True) for own in chosen])
     for _ in range(settings.epochs):
-        orders = [
-            own[torch.randperm(len(own), generator=g)] for own, g in zip(chosen, generators, strict=True)
-        ]
+        orders = [own[torch.randperm(len(own), generator=g)] for own, g in zip(chosen, streams, strict=True)]
         for batch in torch.stack(orders).split(settings.batch_size, dim=1):
             loss = head_loss(torch.baddbmm(bias, x[batch] - means, weight), y[batch], kind).sum()
             optimiser.zero_grad(set_to_none=True)
@@ -210,8 +201,7 @@ def probabilities(logits: Tensor, kind: str) -> Tensor:
 
 
 def rotated(features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, D) rows standardised, scaled and rotated to (n, R) for their rank R; their mean; (D, R) the way
-    back from weights."""
+    """(n, D) rows standardised, scaled, rotated to their rank, (n, R); their mean; (D, R) the way back."""
     features = np.asarray(features, np.float64)
     mean, deviation = features.mean(axis=0), features.std(axis=0)
     scale = np.where(deviation > 1e-8 * max(deviation.max(), 1e-300), deviation, np.inf)
