@@ -303,10 +303,9 @@ def control_rows(
             table = embedded_table(encoder, images, options, f"{UNTRAINED} {seed}")
             tables.append(replace(table, origin={**table.origin, "control": "untrained", "seed": seed}))
         rows.append(FeatureRow(UNTRAINED, tuple(tables), options.chosen, control=True))
-    fitted = images if fit_on is None else fit_on
+    fitted = fit_on or images
     components = component_count(len(fitted))  # whitening needs many more rows than components
-    inputs = {"images": images.images, "components": components}
-    inputs |= {} if fit_on is None else {"fit_on": fit_on.images}
+    inputs = {"images": images.images, "components": components, "fit_on": fitted.images}
     pca = options.memory.recall_one(
         "pca", inputs, lambda: pca_features(images, components=components, fit_on=fitted).factors["pca"]
     )

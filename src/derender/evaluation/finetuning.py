@@ -21,11 +21,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Generator, Tensor, nn
 
-from derender.baselines.controls import untrained_twin
 from derender.baselines.supervised import drawn_labelled
 from derender.data import ImageSet, Split, split_indices
 from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, numbers_of, with_verdicts
-from derender.evaluation.feature_rows import UNTRAINED, control_rows, embedded_table
+from derender.evaluation.feature_rows import control_rows, embedded_table
 from derender.evaluation.linear_probes import head_loss, probabilities
 from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
 from derender.evaluation.linear_task import Rows, Task, task_of
@@ -272,11 +271,10 @@ def score_finetuned(
     start = (task.start or task.build().model).to(tuned.device)
     parts = (learned_and_tested, target.split.train)
     shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
-    models, factors = {"frozen": start, UNTRAINED: untrained_twin(start, seed)}, task.config.target.factors
-    again = Options(cache=kept)
-    runs = {name: [embedded_table(one, shown, again).concatenate(factors)] for name, one in models.items()}
-    plain = control_rows(shown, None, again, fit_on=fitted)  # which learned nothing
-    runs |= {row.name: row.arrays() for row in plain}
+    factors, device = task.config.target.factors, tuned.device.type
+    options = Options(factors=factors, untrained_seeds=1, seed=seed, device=device, cache=kept)
+    runs = {"frozen": [embedded_table(start, shown, options).concatenate(factors)]}
+    runs |= {row.name: row.arrays() for row in control_rows(shown, start.settings, options, fit_on=fitted)}
     asked = target.asked.select(learned_and_tested)
     rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
     how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}

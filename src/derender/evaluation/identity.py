@@ -74,10 +74,9 @@ def identify(
 
     right = {name: np.mean(list(map(recognised, runs)), axis=0) for name, runs in ready.features.items()}
     right["chance"] = (who[shown] == who[probe, None]).mean(axis=1)
-    angles, quiet = None if angle is None else angle[probe], (*ready.controls, "chance")
-    scored, columns, probes = binned_rows(right, angles, how.drawn(who[probe]), quiet, bins=bins)
-    near = known & (angle <= cluster_within) if angle is not None else np.zeros(len(who), bool)
-    if len(set(who[near])) > 1 and len(set(who[near])) < near.sum():
+    quiet, near = (*ready.controls, "chance"), known & (angle <= cluster_within)
+    scored, columns, probes = binned_rows(right, angle[probe], how.drawn(who[probe]), quiet, bins=bins)
+    if 1 < len(set(who[near])) < near.sum():
         codes = {name: [run[near] for run in runs] for name, runs in ready.features.items()}
         own = {"features": codes, "labels": {label: who[near]}, "controls": ready.controls}
         result = compare_clusterings(**own, **how.scoring).rows
@@ -98,15 +97,14 @@ def identify(
         "probes": probes, "centred": centred,
         "rows": bootstrap.numbers_of(scored),
     }  # fmt: skip
-    return Scores(
-        tables, values, [*how.notes, verdict(scored[0], "all", columns["all"]), how.memory.summary()], scored
-    )
+    notes = [*how.notes, verdict(scored[0], "all", columns["all"]), how.memory.summary()]
+    return Scores(tables, values, notes, scored)
 
 
-def _angles(table: FeatureTable, by: str | None) -> np.ndarray | None:
-    """Sizes of a column of angles in degrees, (N,); None where no column was named and there is no light."""
+def _angles(table: FeatureTable, by: str | None) -> np.ndarray:
+    """Sizes of a column of angles in degrees, (N,); NaN where no column was named and there is no light."""
     if by is None and "light_deg" not in table.labels:
-        return None
+        return np.full(len(table), np.nan)
     name = by or "light_deg"
     values = table.label(name)
     if values.dtype.kind not in "fiu":
@@ -116,7 +114,7 @@ def _angles(table: FeatureTable, by: str | None) -> np.ndarray | None:
 
 
 def _gallery(
-    table: FeatureTable, who: np.ndarray, angle: np.ndarray | None, known: np.ndarray, rule: str | None
+    table: FeatureTable, who: np.ndarray, angle: np.ndarray, known: np.ndarray, rule: str | None
 ) -> np.ndarray:
     """Which rows are the gallery, (N,) bool."""
     if rule is not None:
@@ -129,8 +127,7 @@ def _gallery(
             raise ValueError(f"no image has {rule}: the gallery is empty")
         return known & wanted
     rows, chosen = np.flatnonzero(known), np.zeros(len(who), bool)
-    if angle is not None:
-        rows = rows[np.argsort(angle[rows], kind="stable")]
+    rows = rows[np.argsort(angle[rows], kind="stable")]
     chosen[rows[np.unique(who[rows], return_index=True)[1]]] = True
     return chosen
 

@@ -90,7 +90,7 @@ def image_rows(
 
 def binned_rows(
     scores: Mapping[str, np.ndarray],
-    angle: np.ndarray | None,
+    angle: np.ndarray,
     weights: np.ndarray,
     controls: Collection[str] | None = None,
     *,
@@ -98,16 +98,12 @@ def binned_rows(
     digits: int = 3,
     bins: Sequence[float] = LIGHT_BINS_DEG,
 ) -> tuple[tuple[bootstrap.ScoredRow, ...], dict[str, Column], dict[str, int]]:
-    """Rows of (N,) scores; columns for all and for groups by (N,) angles in degrees; number of images in
-    each.
+    """Rows of (N,) scores; columns for all and for groups by (N,) angles in degrees; images in each.
 
-    ``bins`` are upper edges; larger angles are "beyond". The rest is as of ``image_rows``.
+    ``bins`` are upper edges; larger angles are "beyond", NaN in no group. The rest is as of ``image_rows``.
     """
-    count = len(next(iter(scores.values())))
-    inside = {"all": np.ones(count, bool)}
+    inside = {"all": np.ones(len(angle), bool)}
     for low, high in pairwise((-1.0, *bins, np.inf)):
-        if angle is None:
-            break
         inside["beyond" if high == np.inf else f"<= {high:g}"] = (angle > low) & (angle <= high)
     inside = {name: rows for name, rows in inside.items() if rows.any()}
     counts = {name: int(rows.sum()) for name, rows in inside.items()}

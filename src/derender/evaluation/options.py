@@ -85,11 +85,9 @@ class Options:
         """So many seeds, from ``seed`` on."""
         return tuple(range(self.seed, self.seed + count))
 
-    def stage(self, description: str, unit: str = "images") -> Progress | None:
+    def stage(self, description: str, unit: str = "images") -> Progress:
         """A callback of one stage's (done, total), which names the stage."""
-        progress = self.progress
-        if progress is None:
-            return None
+        progress = self.progress or (lambda *_, **__: None)
         return lambda done, total: progress(done, total, description=description, unit=unit)
 
     def at(self, image_size: int, files: Sequence[str] | None = None) -> ImageSet:

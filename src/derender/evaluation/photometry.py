@@ -22,8 +22,7 @@ import torch
 from torch import Tensor
 
 from derender.baselines.controls import LUMINANCE, untrained_twin
-from derender.data import ImageSet, read_ground_truth
-from derender.data.image_set import as_float
+from derender.data import ImageSet, as_float, read_ground_truth
 from derender.evaluation.angles import agreement, agreement_table
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of
 from derender.evaluation.image_scores import binned_rows, image_rows
@@ -246,8 +245,7 @@ def relight(
             scores = reconstruction_scores(shown, photos[targets], covered)
             apart["PSNR"].setdefault(name, []).append(scores.psnr_db_each)
             apart["SSIM"].setdefault(name, []).append(scores.ssim_each)
-        if progress is not None:
-            progress(number + 1, len(people))
+        progress(number + 1, len(people))
     if not rows:
         raise ValueError("no two people have images in the same two lights: nothing to compare")
     tables, notes = [], list(how.notes)

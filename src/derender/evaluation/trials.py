@@ -272,8 +272,7 @@ def generated_trial(recipe: Recipe, axes: Sequence[Axis], levels: tuple[float, .
         total, progress = sum(map(len, images)) + len(asked) * len(images[1]), how.stage("generating")
         for axis, angle in asked:
             images.append(recipe.generate("tested", axis=axis, angle=angle).images)
-            if progress is not None:
-                progress(sum(map(len, images)), total)
+            progress(sum(map(len, images)), total)
         return {"images": np.concatenate(images), **result}
 
     result = how.memory.recall("generated", inputs, make)
