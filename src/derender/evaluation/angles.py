@@ -26,8 +26,7 @@ from derender.evaluation.options import Options
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import Column, Scores, ScoreTable, scored_table
 from derender.evaluation.truth import angle_deg, light_in_camera
-from derender.features import map_batches
-from derender.features.table import named
+from derender.features import map_batches, named
 from derender.inputs import as_model
 from derender.model import Derenderer
 from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, require_regular

@@ -17,16 +17,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from derender.evaluation import bootstrap, feature_rows
+from derender.evaluation import clustering_scores as measures
 from derender.evaluation.clustering_methods import METHODS, approximation, clusterings, finch
-from derender.evaluation.clustering_scores import (
-    CLUSTER_COLUMNS,
-    METRICS,
-    SEEDS,
-    chance_scores,
-    cluster_scores,
-    encoded,
-    scores_of_counts,
-)
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, judged_tables, verdict
@@ -73,12 +65,8 @@ def cluster(
             levels[row.name] = finch_levels(ready.features[row.name][0], ready.labels[names[0]], how.memory)
             tables.append(finch_table(row.name, levels[row.name], result.labels[names[0]]))
     approximate = approximation(method, result.n_rows)
-    notes = [
-        *how.notes,
-        *left_out,
-        verdict(result.rows[0], "accuracy", CLUSTER_COLUMNS["accuracy"]),
-        *filter(None, [approximate]),
-    ]
+    judged = verdict(result.rows[0], "accuracy", measures.CLUSTER_COLUMNS["accuracy"])
+    notes = [*how.notes, *left_out, judged, *filter(None, [approximate])]
     if ready.n_dropped:
         why = f"without a label of {', '.join((*names, *mean_by))}"
         if min_count > 1 or max_count:
@@ -157,14 +145,15 @@ def compare_clusterings(
         values = np.concatenate(parts, axis=1)  # (runs, 1 + resamples, labels, scores)
         quiet = {*controls, "majority"}
         mean = values.mean(axis=2)
-        rows.append(bootstrap.scored_row(name, name in quiet, METRICS, mean, centred=True, most=1.0))
+        rows.append(bootstrap.scored_row(name, name in quiet, measures.METRICS, mean, centred=True, most=1.0))
         first_run = zip(labels, values[0, 0].tolist(), strict=True)
-        per_label[name] = {label: dict(zip(METRICS, own, strict=True)) for label, own in first_run}
-    orders = [np.random.default_rng(one).permutation(n_rows) for one in SEEDS]
+        per_label[name] = {label: dict(zip(measures.METRICS, own, strict=True)) for label, own in first_run}
+    orders = [np.random.default_rng(one).permutation(n_rows) for one in measures.SEEDS]
     deals = [_scorer(numbers, {label: own[order] for label, own in first.items()}) for order in orders]
     chance = np.stack([deal(once)[0].mean(axis=0) for deal in deals], axis=1)
     same = [bootstrap.constant(own, resample_count) for own in chance]
-    rows.append(bootstrap.ScoredRow("chance", True, len(deals), dict(zip(METRICS, same, strict=True))))
+    by_score = dict(zip(measures.METRICS, same, strict=True))
+    rows.append(bootstrap.ScoredRow("chance", True, len(deals), by_score))
     n_missing = sum(int((values < 0).sum()) for values in numbers.values())
     judged, dropped = bootstrap.with_verdicts(rows), int((~labelled).sum())
     return ClusterComparison(judged, method, sizes, n_rows, dropped, n_missing, per_label)
@@ -172,7 +161,7 @@ def compare_clusterings(
 
 def _numbered(values: np.ndarray, name: str) -> np.ndarray:
     """Classes as integers from 0, -1 where missing."""
-    classes = encoded(values)
+    classes = measures.encoded(values)
     known, count = int((classes >= 0).sum()), int(classes.max(initial=-1)) + 1
     if count < 2:
         raise ValueError(
@@ -207,7 +196,8 @@ def _scorer(
 
     def scores(weights: np.ndarray) -> np.ndarray:
         parts = zip(np.split((matrix @ weights.T).T, ends, axis=1), shapes, strict=True)
-        return np.stack([scores_of_counts(part.reshape(-1, *shape)) for part, shape in parts], axis=1)
+        counts = (part.reshape(-1, *shape) for part, shape in parts)
+        return np.stack([measures.scores_of_counts(one) for one in counts], axis=1)
 
     return scores
 
@@ -221,7 +211,7 @@ def clustering_tables(result: ClusterComparison, asked: str) -> list[ScoreTable]
         caption += f"; {result.n_dropped:,} rows without label left out"
     if result.n_missing:
         caption += f"; {result.n_missing:,} single labels unknown"
-    return judged_tables(caption, "features", result.rows, CLUSTER_COLUMNS, asked)
+    return judged_tables(caption, "features", result.rows, measures.CLUSTER_COLUMNS, asked)
 
 
 @dataclass(frozen=True)
@@ -239,12 +229,11 @@ def finch_levels(features: np.ndarray, labels: np.ndarray, memory: Memory | None
     Rows without label are left out before. Purity and NMI grow with the number of clusters: compare levels of
     different features by ARI and the number of clusters.
     """
-    labels = np.asarray(labels)
-    known = ~missing(labels)
-    hierarchy = finch(np.asarray(features)[known], memory)
-    counted = zip(hierarchy.counts, hierarchy.partitions, strict=True)
-    own = labels[known]
-    return tuple(Level(count, cluster_scores(own, one), chance_scores(own, one)) for count, one in counted)
+    known, levels = ~missing(labels), []
+    hierarchy, own = finch(np.asarray(features)[known], memory), np.asarray(labels)[known]
+    for count, one in zip(hierarchy.counts, hierarchy.partitions, strict=True):
+        levels.append(Level(count, measures.cluster_scores(own, one), measures.chance_scores(own, one)))
+    return tuple(levels)
 
 
 def finch_table(name: str, levels: Sequence[Level], classes: int) -> ScoreTable:
@@ -252,8 +241,8 @@ def finch_table(name: str, levels: Sequence[Level], classes: int) -> ScoreTable:
     columns = (
         Column("accuracy", None, note="weighted purity, 0 to 1; grows with the number of clusters"),
         Column("by chance", None, note="accuracy of the same cluster sizes, rows dealt at random"),
-        CLUSTER_COLUMNS["nmi"],
-        CLUSTER_COLUMNS["ari"],
+        measures.CLUSTER_COLUMNS["nmi"],
+        measures.CLUSTER_COLUMNS["ari"],
     )
     rows = []
     for one in levels:

@@ -114,7 +114,7 @@ def ward_in_cells(
     """Approximate Ward over the rows of (N, D) features: ``tree`` and ``leaf``, as ``cut`` takes them."""
     points = neighbours.finite_rows(features, "Ward clustering").astype(np.float32, copy=False)
     groups = neighbours.cells(points, rows_per_cell)
-    trees = list(neighbours.of_each(lambda cell: _tree(points[groups[cell]]), groups))
+    trees = neighbours.of_each(lambda cell: _tree(points[groups[cell]]), groups)
     # the cheapest merges of all cells are made until so many clusters are left
     heights = np.concatenate([tree[:, 2] for tree in trees])
     cell = np.repeat(np.arange(len(groups)), [len(tree) for tree in trees])
@@ -287,10 +287,8 @@ def finch_clusters(
 
 def _linked(rows: np.ndarray) -> np.ndarray:
     """Connected parts of the links from each row to its nearest."""
-    count = len(rows)
-    links = csr_array(
-        (np.ones(count), (np.arange(count), neighbours.nearest_rows(rows)[0])), shape=(count, count)
-    )
+    count, nearest = len(rows), neighbours.nearest_rows(rows)[0]
+    links = csr_array((np.ones(count), (np.arange(count), nearest)), shape=(count, count))
     return connected_components(links, directed=True, connection="weak")[1]
 
 

@@ -43,9 +43,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Rows:
-    """Who is tested, (T,) row numbers, and who learns: for each number of labels, (S, number) rows for
-    each of S seeds; smaller sets lie in larger.
-    """
+    """(T,) rows tested; by number of labels, (S, number) rows learned from, smaller sets within larger."""
 
     test: np.ndarray
     train: Mapping[int, np.ndarray]
@@ -173,9 +171,7 @@ def mean_precision(targets: np.ndarray, probabilities: np.ndarray) -> float:
 def count_scores(
     targets: np.ndarray, probabilities: np.ndarray, kind: str, weights: np.ndarray
 ) -> np.ndarray:
-    """Accuracy and balanced accuracy, (B, 2), of ``linear_scores`` on resamples: (B, T) times each is
-    drawn.
-    """
+    """Accuracy and balanced accuracy of ``linear_scores``, (B, 2), where (B, T) ``weights`` draw the rows."""
     if targets.shape != probabilities.shape:
         raise ValueError(f"targets {targets.shape} and probabilities {probabilities.shape} must be alike")
     positive, negative = (targets == 1).astype(np.float32), (targets == 0).astype(np.float32)

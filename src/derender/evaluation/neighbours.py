@@ -9,7 +9,7 @@ row goes to its nearest centre. Cells that came out too large are divided again.
 do not see each other.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -88,8 +88,7 @@ def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         look(groups[cell], others, np.searchsorted(others, groups[cell]))
         nearest[groups[cell]] = others[nearest[groups[cell]]]
 
-    for _ in of_each(look_around, groups):
-        pass
+    of_each(look_around, groups)
     return nearest, distance
 
 
@@ -113,10 +112,10 @@ def cells(points: Float32[np.ndarray, "n d"], rows_per_cell: int) -> list[Int64[
     return groups
 
 
-def of_each(work: Callable[[int], T], groups: Sequence[np.ndarray]) -> Iterator[T]:
+def of_each(work: Callable[[int], T], groups: Sequence[np.ndarray]) -> list[T]:
     """What ``work`` gives for the number of each cell, in order, computed on all cores, one cell on each."""
     with threadpool_limits(1), ThreadPoolExecutor(usable_cores(), thread_name_prefix="cell") as pool:
-        yield from pool.map(work, range(len(groups)))
+        return list(pool.map(work, range(len(groups))))
 
 
 def _centres(sample: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:

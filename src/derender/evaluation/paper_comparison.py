@@ -73,7 +73,8 @@ def compare(
                 raise ValueError(f"two models have the name {name!r}: give each its own")
             result = segment(
                 model, images, masks=masks, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
-                settings=SegmentSettings(epochs=epochs), **{**options, "cache": how.memory},
+                settings=SegmentSettings(epochs=epochs), dataset=how.dataset, limit=how.limit,
+                device=how.device, resamples=how.resamples, cache=how.memory, progress=how.progress,
             )  # fmt: skip
             shown = (result.tables[-1], *result.tables[:-1])
             tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]
@@ -128,8 +129,8 @@ def compare(
                     notes.append(f"{part.name}: FINCH left out: {error}")
                 else:
                     more["finch"] = finch.numbers()
-                    own = (row for row in finch.rows if row.name in ready.features)
-                    scored += [replace(row, name=f"{row.name}, FINCH") for row in own]
+                    likewise = (row for row in finch.rows if row.name in ready.features)
+                    scored += [replace(row, name=f"{row.name}, FINCH") for row in likewise]
             caption = f"{part.name}, {beside} ({METHODS[method]})"
             last = {"intervals": (), "deviations": (), "more": interval_cells("accuracy", shown["accuracy"])}
             ours = scored_table(caption, "features", scored, shown, **last)

@@ -17,16 +17,11 @@ import numpy as np
 from derender.baselines.controls import untrained_twin
 from derender.data import GivenImages, GroundTruth, ImageSet, as_batch, read_ground_truth
 from derender.data.source import evenly_spaced
+from derender.evaluation import pixels
 from derender.evaluation.bootstrap import numbers_of
 from derender.evaluation.image_scores import ImageResult
 from derender.evaluation.memory import content_hash
 from derender.evaluation.options import Options
-from derender.evaluation.pixels import (
-    COMPONENT_IMAGES,
-    ReconstructionResult,
-    evaluate_reconstruction,
-    mean_image,
-)
 from derender.evaluation.score_table import Scores, verdict
 from derender.evaluation.truth import FactorResult, GeometryResult, evaluate_factors, evaluate_geometry
 from derender.features import Progress, embed_images, model_fingerprint
@@ -70,13 +65,13 @@ def geometry(
     known = {name: getattr(exact, name) for name in names if getattr(exact, name) is not None}
     scored = optimised(model, fit_steps)
     same: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, how.seed)}
-    again = partial(evaluate_reconstruction, scored, exact.images, components_of=exact.images, **same)
+    again = partial(pixels.evaluate_reconstruction, scored, exact.images, components_of=exact.images, **same)
     protocols: Protocols = {
         "geometry": (GeometryResult, partial(evaluate_geometry, scored, exact, progress=how.progress, **same))
     }
     if {"albedo", "light", "camera"} <= set(known):
         protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **same)
-    protocols["reconstruction"] = ReconstructionResult, again
+    protocols["reconstruction"] = pixels.ReconstructionResult, again
     return _scored(model, protocols, {**known, "seed": how.seed, "steps": fit_steps or 0}, how)
 
 
@@ -104,12 +99,13 @@ def reconstruction(
     images = as_images(images, model.image_size, dataset=how.dataset, limit=how.limit)
     known = (training_images or images).images
     make = partial(
-        evaluate_reconstruction, optimised(model, fit_steps), images.images, mean=mean_image(known),
-        components_of=known[evenly_spaced(len(known), COMPONENT_IMAGES)], batch_size=batch_size,
-        untrained=untrained_twin(model, how.seed), progress=how.progress,
+        pixels.evaluate_reconstruction, optimised(model, fit_steps), images.images,
+        mean=pixels.mean_image(known), batch_size=batch_size, progress=how.progress,
+        components_of=known[evenly_spaced(len(known), pixels.COMPONENT_IMAGES)],
+        untrained=untrained_twin(model, how.seed),
     )  # fmt: skip
     inputs = {"images": images.images, "fitted": known, "seed": how.seed, "steps": fit_steps or 0}
-    result = _scored(model, {"reconstruction": (ReconstructionResult, make)}, inputs, how)
+    result = _scored(model, {"reconstruction": (pixels.ReconstructionResult, make)}, inputs, how)
     intervals = result.values["intervals"]["reconstruction"]
     return replace(result, values={**result.values, "intervals": intervals})
 
@@ -166,5 +162,5 @@ def copy_cost(
         own, moved_to = np.asarray(feature, np.float64), np.asarray(passes[1][name], np.float64)
         apart = np.sqrt(2 * own.var(axis=0, ddof=1).sum())  # of two images drawn at random
         moved[name] = float(np.linalg.norm(own - moved_to, axis=1).mean() / apart) if apart else 0.0
-    after, before = (evaluate_reconstruction(one, images).model.l1 for one in (other, model))
+    after, before = (pixels.evaluate_reconstruction(one, images).model.l1 for one in (other, model))
     return {"moved": moved, "l1": after, "l1_before": before}

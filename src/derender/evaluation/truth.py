@@ -163,20 +163,14 @@ def evaluate_geometry(
     def score(predicted: Tensor, covered: Tensor) -> GeometryScores:
         return geometry_scores(predicted, covered, depth, mask, model.fov_deg, normal)
 
-    everywhere, fresh = torch.ones_like(mask), None
-    if untrained is not None:
-        fresh = score(*predicted_depth(untrained, truth.images, batch_size=batch_size))
+    see = partial(predicted_depth, images=truth.images, batch_size=batch_size)
+    everywhere = torch.ones_like(mask)
     return GeometryResult(
-        score(*predicted_depth(model, truth.images, batch_size=batch_size, progress=progress)),
+        score(*see(model, progress=progress)),
         score(average_depth(depth, mask).expand_as(depth), everywhere),
         score(torch.ones_like(depth), everywhere),
-        fresh,
+        None if untrained is None else score(*see(untrained)),
     )
-
-
-_ALBEDO = "root mean square error after each image's best scale, best 0"
-_CAMERA = "mean angle in degrees of the remaining rotation, best 0"
-_LIGHT = "mean angle in degrees between true and predicted direction, best 0"
 
 
 @dataclass(frozen=True)
@@ -211,16 +205,16 @@ class FactorScores:
 
 @dataclass(frozen=True)
 class FactorResult(ImageResult):
-    """A model's errors in albedo, light and camera beside the best constant answer, and fresh weights (None
-    without an architecture).
-    """
+    """Errors in albedo, light and camera beside the best constant answer, and fresh weights if requested."""
 
     columns: ClassVar[Mapping[str, Column]] = {
-        "albedo": Column("albedo", "low", 4, _ALBEDO),
+        "albedo": Column("albedo", "low", 4, "root mean square error after each image's best scale, best 0"),
         "albedo_global": Column("one scale", "low", 4, "the same after one scale for all images"),
-        "light": Column("light", "low", 1, _LIGHT),
+        "light": Column(
+            "light", "low", 1, "mean angle in degrees between true and predicted direction, best 0"
+        ),
         "aligned": Column("aligned", "low", 1, "the same after the best rotation of all directions"),
-        "camera": Column("camera", "low", 1, _CAMERA),
+        "camera": Column("camera", "low", 1, "mean angle in degrees of the remaining rotation, best 0"),
     }
     caption = "Albedo, light and camera on {}"
     titles: ClassVar[Mapping[str, str]] = {
@@ -326,8 +320,7 @@ def evaluate_factors(
             raise ValueError(
                 "prediction and truth share no pixel in any image: check the camera or the masks"
             )
-        both_ways = (light_error(light, camera, *exact, aligned=one) for one in (False, True))
-        lights = (one.each_deg for one in both_ways)
+        lights = (light_error(light, camera, *exact, aligned=one).each_deg for one in (False, True))
         return scored(albedo, both, *lights, camera_error(camera, exact[1]).each_deg)
 
     mean = (true.sum(dim=0) / true_mask.sum(dim=0).clamp_min(1)).expand_as(true)

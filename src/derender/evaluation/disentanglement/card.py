@@ -17,11 +17,7 @@ import numpy as np
 from derender.baselines.controls import pca_features, untrained_twin
 from derender.data import ImageSet
 from derender.evaluation.bootstrap import LEVEL
-from derender.evaluation.disentanglement.ground_truth import (
-    GroundTruthScores,
-    ground_truth_scores,
-    true_factors,
-)
+from derender.evaluation.disentanglement import ground_truth
 from derender.evaluation.disentanglement.similarity import (
     PearsonScores,
     SimilarityScores,
@@ -39,6 +35,8 @@ from derender.storage.places import counted
 
 MODEL = "model"
 MIN_IMAGES = 20
+ENDS = ("ratio_95", "ratio_parameters_95")
+"""Intervals of the swap ratio, of features and of decoded parameters."""
 
 _SWAP = Column("swap", "high", 2, "move of the exchanged feature over the others'; chance 1")
 _DECODED = Column("decoded", "high", 2, "the same of decoded depth, albedo, light and camera")
@@ -53,9 +51,9 @@ _SUMMARY = {  # by attribute of ``FeatureScores``
     ),
     "similarity.mean_cross_r2": Column("cross R2", note="held-out variance explained by another; best 0"),
     "swap.ratio": _SWAP,
-    "interval.0": interval_column(_SWAP, "images"),
+    ENDS[0]: interval_column(_SWAP, "images"),
     "swap.ratio_parameters": _DECODED,
-    "interval.1": interval_column(_DECODED, "images"),
+    ENDS[1]: interval_column(_DECODED, "images"),
 }
 _WHOLE = {
     "truth.by_feature.disentanglement": Column("D", note="a feature holds one factor, best 1"),
@@ -75,21 +73,18 @@ _DIMENSIONS = {
 
 @dataclass(frozen=True)
 class FeatureScores:
-    """All scores of one set of features, one seed; None are ``truth`` without true factors among the labels
-    and ``swap`` without a decoder.
-    """
+    """All scores of features, one seed; ``truth`` is None without true factors, ``swap`` without decoder."""
 
     pearson: PearsonScores
     similarity: SimilarityScores
-    truth: GroundTruthScores | None
+    truth: ground_truth.GroundTruthScores | None
     swap: SwapScores | None
 
     def get(self, path: str) -> Any:
         """A number or matrix by its path, such as ``swap.ratio``; None where a part is missing."""
         value: Any = self
         for name in path.split("."):
-            if value is not None:
-                value = value[int(name)] if name.isdigit() else getattr(value, name)
+            value = None if value is None else getattr(value, name)
         return value
 
 
@@ -120,8 +115,7 @@ class DisentanglementCard:
             if scores.swap is None:
                 return vars(scores)
             swap = {name: value for name, value in vars(scores.swap).items() if name != "resampled"}
-            ends = zip(("ratio_95", "ratio_parameters_95"), swap_intervals([scores.swap]), strict=True)
-            return {**vars(scores), "swap": {**swap, **dict(ends)}}
+            return {**vars(scores), "swap": swap | swap_intervals([scores.swap])}
 
         return {name: [plain(scores) for scores in results] for name, results in self.rows.items()}
 
@@ -154,14 +148,12 @@ class DisentanglementCard:
         """A row of means for each set of features; with several seeds, standard deviations below."""
         rows = []
         for name, results in self.rows.items():
-            tests = [one.swap for one in results if one.swap is not None]
-            ends = swap_intervals(tests) if tests else (None, None)
+            ends = swap_intervals([one.swap for one in results if one.swap is not None])
             means: list[Cell] = []
             deviations: list[Cell] = []
             for path in columns:
-                interval = path.startswith("interval")
-                values = [] if interval else [v for one in results if (v := one.get(path)) is not None]
-                means.append(ends[int(path[-1])] if interval else float(np.mean(values)) if values else None)
+                values = [] if path in ENDS else [v for one in results if (v := one.get(path)) is not None]
+                means.append(ends.get(path, float(np.mean(values)) if values else None))
                 deviations.append(f"{np.std(values, ddof=1):.3f}" if len(values) > 1 else None)
             rows.append(Row(name, means, name != MODEL))
             if len(results) > 1:
@@ -222,7 +214,7 @@ def disentangle(
     images.require(MIN_IMAGES, "the disentanglement card")
     if not seeds:
         raise ValueError("the card needs at least one seed")
-    pixels, (factors, unused) = images.images, true_factors(images.labels)
+    pixels, (factors, unused) = images.images, ground_truth.true_factors(images.labels)
     inputs = {
         "weights": model_fingerprint(model), "settings": model.settings.model_dump(mode="json"),
         "images": pixels, **{f"factor {factor.name}": factor.values for factor in factors},
@@ -271,7 +263,7 @@ def disentangle(
                 known = tuple({key: each[places] for key, each in one.items()} for one in both)
             swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size, known=known)
         if len(factors) >= 2:
-            truth = ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
+            truth = ground_truth.ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
         return FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap)
 
     names = (MODEL, "untrained encoder", "shuffled rows", "random pixels", "PCA")
@@ -295,15 +287,15 @@ def disentangle(
     return Scores(tables, values, [*notes, kept.summary()], result=card)
 
 
-def swap_intervals(tests: Sequence[SwapScores]) -> tuple[Interval, Interval]:
-    """95 % intervals of the mean over seeds of the swap ratio, of features and of decoded parameters. NaN
-    where a ratio is NaN or infinite.
-    """
+def swap_intervals(tests: Sequence[SwapScores]) -> dict[str, Interval]:
+    """95 % intervals of mean ratios over seeds, by ``ENDS``; NaN where a ratio is NaN or infinite."""
+    if not tests:
+        return {}
     drawn = np.mean([test.resampled for test in tests], axis=0)
     ends = np.full((2, 2), np.nan)
     if len(drawn) and np.isfinite(drawn).all():
         ends = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
-    return Interval(*ends[:, 0].tolist()), Interval(*ends[:, 1].tolist())
+    return {name: Interval(*own) for name, own in zip(ENDS, ends.T.tolist(), strict=True)}
 
 
 def shuffled_rows(features: Mapping[str, np.ndarray], seed: int) -> dict[str, np.ndarray]:
