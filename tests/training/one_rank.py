@@ -17,7 +17,7 @@ from derender.model import Derenderer
 from derender.objectives.self_features import SelfFeatures
 from derender.render import render_scene
 from derender.training.config import ObjectiveSettings, resolve
-from derender.training.distributed import ALONE, Ranks, leave, open_fabric, ranks_of
+from derender.training.distributed import ALONE, Ranks, leave, open_fabric
 from derender.training.step import training_step
 
 OBJECTIVE = ObjectiveSettings(loocc="all", cycle_weight=1.0, smoothness_weight=0.1)
@@ -67,7 +67,8 @@ def main() -> None:
         sys.stderr.flush()
     os.environ["MASTER_PORT"] = sys.argv[3]  # the last command has left its group
     torch.Tensor.float = torch.Tensor.double
-    ranks = ranks_of(open_fabric("cpu"))
+    fabric = open_fabric("cpu")
+    ranks = Ranks(fabric.global_rank, fabric.world_size)
     result = {"count": ranks.count, "steps": [largest_difference(own, ranks) for own in (1.0, 0.3)]}
     if ranks.first:
         Path(sys.argv[1]).write_text(json.dumps(result))

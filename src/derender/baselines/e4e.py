@@ -136,11 +136,10 @@ class E4eEncoder(nn.Module):
         middle = _as_large(coarse, at_8) + self.to_middle(at_8)
         fine = _as_large(middle, at_4) + self.to_fine(at_4)
         sources = [coarse] * FIRST_MIDDLE + [middle] * (FIRST_FINE - FIRST_MIDDLE) + [fine] * len(self.heads)
-        codes = [self.heads[0](coarse)]
-        for code, (head, source) in enumerate(zip(self.heads, sources, strict=False)):
-            if code:
-                codes.append(codes[0] + head(source) if code <= released else codes[0])
-        return torch.stack(codes, dim=1)
+        free = zip(self.heads[: released + 1], sources, strict=False)
+        first, *added = (head(source) for head, source in free)
+        same = len(self.heads) - 1 - len(added)
+        return torch.stack([first, *(first + change for change in added), *[first] * same], dim=1)
 
 
 def _as_large(maps: Tensor, like: Tensor) -> Tensor:
@@ -155,7 +154,6 @@ class E4e(LoopModel):
     given_as = ", for ris as --set e4e=RUN"
     not_judged = ("delta", "prior")
     settings: E4eSettings
-    given_size: int | None = None
     centre: Tensor
     seen: Tensor
     released: Tensor
@@ -171,15 +169,10 @@ class E4e(LoopModel):
 
     @classmethod
     def open(cls, source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
-        """The encoder of a run, for such images; see `open_baseline`."""
+        """The encoder of a run, for images of its size or smaller ones; see `open_baseline`."""
         net = super().open(source)
-        net.given_size = image_size
+        net.image_size = image_size or net.image_size
         return net
-
-    @property
-    def image_size(self) -> int:
-        """Side of the input images: the network's, or a smaller one that is enlarged to it."""
-        return self.given_size or self.settings.image_size
 
     @classmethod
     def build(cls, config: E4eConfig) -> "E4e":
@@ -197,10 +190,9 @@ class E4e(LoopModel):
         config: E4eConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress
     ) -> PerceptualFeatures | None:
         """Features learnt from the images; None if they have no weight."""
-        objective = config.objective
-        if objective.perceptual_weight == 0:
+        if config.objective.perceptual_weight == 0:
             return None
-        return self_features_of(file, images, config.seed, objective.self_features_steps, progress)
+        return self_features_of(config, file, images, progress)
 
     def invert(self, images: Images) -> Codes:
         """W+ of images in 0..1, which are enlarged to the encoder's size where they are smaller."""

@@ -29,7 +29,6 @@ from derender.training import config as configs
 from derender.training import run_folder
 from derender.training import task as loop
 from derender.training.loop import train_task
-from derender.training.watch import FiniteWatch
 
 PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
 OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
@@ -63,10 +62,11 @@ class BaselineModel(nn.Module, ABC):
     settings_type: ClassVar[type[BaselineSettings]]
     config_type: ClassVar[type[Settings]]
     given_as: ClassVar[str] = ""
+    image_size: int  # side of the input images, in pixels
 
     def __init__(self, settings: BaselineSettings):
         super().__init__()
-        self.settings, self.chosen = settings, self.features[:1]
+        self.settings, self.chosen, self.image_size = settings, self.features[:1], settings.image_size
 
     @classmethod
     def open(cls, source: str | Path | None, *, image_size: int | None = None, seed: int = 0) -> Any:
@@ -75,11 +75,6 @@ class BaselineModel(nn.Module, ABC):
             made = f"a run of derender train --model {cls.name}{cls.given_as}"
             raise ValueError(f"the baseline {cls.name} needs a model: {made}")
         return load_baseline(source, cls.name)
-
-    @property
-    def image_size(self) -> int:
-        """Side of the input images, in pixels."""
-        return self.settings.image_size
 
     @property
     def device(self) -> torch.device:
@@ -166,6 +161,8 @@ class LoopModel(BaselineModel):
     """
 
     not_judged: ClassVar[tuple[str, ...]] = ()
+    reconstruct: Callable[[Images], Images]
+    """Images in 0..1 through the network; only of networks that make images again."""
 
     @classmethod
     def build(cls, config: Any) -> "LoopModel":
@@ -182,10 +179,6 @@ class LoopModel(BaselineModel):
     @abstractmethod
     def losses(self, images: Images, run: LossInputs) -> dict[str, Tensor]:
         """Losses and other numbers (OUTSIDE_LOSS) of a batch in 0..1, by name."""
-
-    def reconstruct(self, images: Images) -> Images:
-        """Images in 0..1 through the network; only of networks that make images again."""
-        raise NotImplementedError(f"{self.name} makes no images")
 
     def shown(self, images: Images) -> dict[str, Images]:
         """Images for a sample sheet of a run, by column: the input and the network's output."""
@@ -208,10 +201,6 @@ class BaselineTask(loop.TrainingTask):
         """Names of numbers by which held-out images are not judged."""
         return (*OUTSIDE_LOSS, *network_type(self.config.baseline).not_judged)
 
-    def check(self) -> None:
-        """A missing package or model is an error before a folder is made."""
-        self.build()
-
     def build(self) -> LoopModel:
         """The untrained network; torch's global generator is left as it was."""
         with torch.random.fork_rng(devices=[]):
@@ -230,10 +219,6 @@ class BaselineTask(loop.TrainingTask):
             return loop.StepLosses(total, {name: term.detach() for name, term in terms.items()})
 
         return step
-
-    def watch(self, memory: dict[str, Any]) -> FiniteWatch:
-        """Stops a run whose loss is NaN or infinite."""
-        return FiniteWatch()
 
 
 class ShortRun:

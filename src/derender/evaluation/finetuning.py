@@ -38,7 +38,7 @@ from derender.storage.atomic import atomic_file, new_folder
 from derender.storage.bounded import read_json
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.config import FinetuneConfig
-from derender.training.derender_task import DerenderTask
+from derender.training.derender_task import DerenderTask, require_perceptual
 from derender.training.loop import NOT_RECONSTRUCTION
 from derender.training.run_folder import RunFolder
 from derender.training.task import Losses, PhaseProgress, Precision, StepLosses, TrainingTask
@@ -169,23 +169,20 @@ class FinetuneTask(TrainingTask):
     start: Derenderer | None = None
     outside_loss: tuple[str, ...] = RENDERING_TERMS
 
-    def check(self) -> None:
-        """Raise what is missing or does not fit, before a folder is made."""
-        if self.config.target.rendering_weight > 0:
-            DerenderTask(self.config).check()
-        if self.start is not None and self.start.settings != self.config.model:
+    def build(self) -> FinetunedModel:
+        """The model to start from with a fresh head, the same for the same seed."""
+        factors, config, asked = self.config.target.factors, self.config, self.target.asked
+        if config.target.rendering_weight > 0:
+            require_perceptual(config.objective)
+        if self.start is not None and self.start.settings != config.model:
             raise ValueError(
                 "the networks of a pre-trained model are given: leave out settings of model.network and "
                 "model.ranges"
             )
-        known = {factor.name: factor for factor in (self.start or Derenderer(self.config.model)).factors}
-        for name in self.config.target.factors:
-            named(known, name, "factor")
-
-    def build(self) -> FinetunedModel:
-        """The model to start from with a fresh head, the same for the same seed."""
-        factors, config, asked = self.config.target.factors, self.config, self.target.asked
         model = copy.deepcopy(self.start) or Derenderer.seeded(config.model, config.seed)
+        known = {factor.name: factor for factor in model.factors}
+        for name in factors:
+            named(known, name, "factor")
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             width = config.model.network.code_size * len(factors)

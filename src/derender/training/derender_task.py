@@ -22,7 +22,7 @@ from derender.storage.atomic import DamageNoticed
 from derender.storage.folder import write_config
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
-from derender.training.config import TrainConfig
+from derender.training.config import ObjectiveSettings, TrainConfig
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
 from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
@@ -52,24 +52,16 @@ def train(
         result = train_task(task, images, out, resume=resume, progress=report, accelerator=accelerator, **how)
         if this_rank_writes() and result.stopped != "collapse":
             device = "cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu"
+            split = split_indices(images.files, config.split, seed=config.seed)
+            mapped = isinstance(images.images, np.memmap)
+            some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
+            phase, trained = Progress.of("features", report), load(folder.model, device=device)
             with deterministic_algorithms(config.deterministic):
-                _add_features(config, images, load(folder.model, device=device), folder.model, report)
+                model = make_features(trained, some, config.features, seed=config.seed, progress=phase)
+                write_config(folder.model, [factor.name for factor in model.factors], model.settings)
+                model.features.save(folder.model)
+                store_errors(folder.model, images.images[split.validation[:MAX_VALIDATION_IMAGES]])
     return result
-
-
-def _add_features(
-    config: TrainConfig, images: ImageSet, model: Derenderer, out: Path, report: Callable[[Progress], None]
-) -> None:
-    """Estimate a trained model's features and held-out errors, and save both with it."""
-    split = split_indices(images.files, config.split, seed=config.seed)
-    mapped = isinstance(images.images, np.memmap)
-    some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
-    phase = Progress.of("features", report)
-    model = make_features(model, some, config.features, seed=config.seed, progress=phase)
-    write_config(out, [factor.name for factor in model.factors], model.settings)
-    model.features.save(out)
-    held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
-    store_errors(out, torch.from_numpy(np.ascontiguousarray(held_out)))
 
 
 @dataclass(frozen=True)
@@ -91,16 +83,12 @@ class DerenderTask(TrainingTask):
         own = own_share(self.config.objective, done)
         return own if own in (0.0, 1.0) else None
 
-    def check(self) -> None:
-        """Missing perceptual weights are an error before a folder is made."""
-        if self.config.objective.perceptual == "vgg16":
-            load_vgg16(self.config.objective.vgg16_path)
-
     def build(self) -> Derenderer:
         """The model as the run begins: untrained, or with the weights of ``start_from``.
 
         A FileNotFoundError: there is no such model; a ValueError: its weights do not fit, names the first.
         """
+        require_perceptual(self.config.objective)
         model, start = Derenderer.seeded(self.config.model, self.config.seed), self.config.start_from
         for factor in model.factors if self.config.maps_only else ():
             net: Any = model.nets[factor.name]
@@ -143,8 +131,14 @@ class DerenderTask(TrainingTask):
         return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory, self.ranks)
 
 
+def require_perceptual(objective: ObjectiveSettings) -> None:
+    """Published perceptual features that are missing or damaged are an error."""
+    if objective.perceptual == "vgg16":
+        load_vgg16(objective.vgg16_path)
+
+
 def self_features_of(
-    file: Path, images: UInt8[Tensor, "n 3 h w"], seed: int, steps: int, progress: PhaseProgress
+    config: Any, file: Path, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
 ) -> PerceptualFeatures:
     """Self-trained features from a run's file, or learnt from its images, again where it is damaged."""
     if file.exists():
@@ -153,9 +147,8 @@ def self_features_of(
         except ValueError as problem:
             again = f"{problem}: they are learnt again, from the same seed"
             warnings.warn(again, DamageNoticed, stacklevel=2)
-    features = train_self_features(
-        images, seed=seed, steps=steps, progress=lambda done, total, _: progress(done, total)
-    )
+    how = {"seed": config.seed, "steps": config.objective.self_features_steps}
+    features = train_self_features(images, **how, progress=lambda done, total, _: progress(done, total))
     features.save(file)
     return features
 
@@ -168,8 +161,7 @@ def perceptual_of(
     if objective.perceptual == "none" or objective.perceptual_weight == 0:
         return None
     if objective.perceptual == "self":
-        steps = objective.self_features_steps
-        features = self_features_of(run.perceptual, images, config.seed, steps, progress)
+        features = self_features_of(config, run.perceptual, images, progress)
     else:
         features = load_vgg16(objective.vgg16_path).to(images.device)
         if objective.perceptual_rescaled:

@@ -135,11 +135,6 @@ def open_fabric(accelerator: str) -> Any:
     return fabric
 
 
-def ranks_of(fabric: Any) -> Ranks:
-    """Where this process stands among those of a fabric."""
-    return Ranks(fabric.global_rank, fabric.world_size)
-
-
 def first_to_fail() -> bool:
     """Whether no other process of this run has failed before: the others then end silently; asked once."""
     if started_together() == 1 or not distributed.is_available():

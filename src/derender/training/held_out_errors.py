@@ -147,16 +147,14 @@ def errors_of(model: Any, images: Images, batch_size: int = 64) -> HeldOutErrors
     return HeldOutErrors(pictures=len(errors), quantiles=[float(f"{value:.6g}") for value in quantiles])
 
 
-def store_errors(folder: Path, held_out: UInt8[Tensor, "n 3 h w"]) -> HeldOutErrors | None:
-    """Save the errors of held-out images with the model in ``folder``; None of fewer than 20 it renders."""
+def store_errors(folder: Path, held_out: Images) -> None:
+    """Save the errors of held-out images with the model in ``folder``, if it renders into 20 or more."""
     try:
-        errors = errors_of(load(folder, device=held_out.device), held_out)
+        write_errors(folder, errors_of(load(folder), held_out))
     except NotFinite:
         raise
     except ValueError:
-        return None
-    write_errors(folder, errors)
-    return errors
+        return
 
 
 def write_errors(folder: Path, errors: HeldOutErrors) -> Path:

@@ -24,7 +24,7 @@ from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.storage.folder import SplitRecord, write_split
 from derender.training import checkpoint, process, run_folder
 from derender.training.batches import Reader, batches_of, random_stream
-from derender.training.distributed import open_fabric, ranks_of
+from derender.training.distributed import Ranks, open_fabric
 from derender.training.faster import Replayed, compile_networks
 from derender.training.task import (
     Progress,
@@ -71,21 +71,20 @@ class _Run:
         config = self.config = task.config
         self.report, self.sample_sheet = progress or (lambda _: None), sample_sheet
         fabric = self.fabric = open_fabric(accelerator)
-        ranks = self.ranks = ranks_of(fabric)
+        ranks = self.ranks = Ranks(fabric.global_rank, fabric.world_size)
         self.task = task = task.shared(ranks) if ranks.count > 1 else task
         split = split_indices(images.files, config.split, seed=config.seed)
         batches = batches_of(images.images, split.train, config, fabric.device)
         self.reader, self.train_rows = Reader(batches, ranks), torch.from_numpy(split.train)
-        task.check()
+        self.model: Any = task.build().to(fabric.device)
+        if config.channels_last:
+            self.model.to(memory_format=torch.channels_last)
         self.folder = run_folder.RunFolder(out)
         if ranks.first and resume:
             run_folder.reopen_run(out, config, run_folder.describe_data(images, split))
         elif ranks.first:
             device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
             run_folder.start_run(out, config, run_folder.describe_data(images, split), device)
-        self.model: Any = task.build().to(fabric.device)
-        if config.channels_last:
-            self.model.to(memory_format=torch.channels_last)
         phase = Progress.of("perceptual", self.report)
         with fabric.rank_zero_first():
             losses = task.losses(self.model, self.folder, batches.sample(), phase)
@@ -98,10 +97,8 @@ class _Run:
         held_out = split.validation[:MAX_VALIDATION_IMAGES]
         self.held_rows = torch.from_numpy(held_out)
         self.held_out = torch.from_numpy(np.ascontiguousarray(images.images[held_out])).to(fabric.device)
-        self.state, note = checkpoint.TrainState(), None
-        if resume:
-            both = self.folder.last, self.folder.previous
-            self.state, note = checkpoint.resume_from(*both, self.model, self.optimiser)
+        both = self.folder.last, self.folder.previous  # of a new run neither is there
+        self.state, note = checkpoint.resume_from(*both, self.model, self.optimiser)
         self.fell_back = note is not None  # the damaged checkpoint is not to become the previous one
         self.watcher = task.watch(self.state.watcher) if config.watch else None
         self.validation: dict[str, float] = {}
@@ -114,7 +111,7 @@ class _Run:
         self.noise = Generator(fabric.device) if on_gpu and task.replayable else None
         self.replayed = None
         if self.noise is not None and ranks.count == 1 and config.cuda_graph == "auto":
-            self.replayed = Replayed(self.update, self.noise, self.note)
+            self.replayed = Replayed(partial(self.update, noise=self.noise), self.noise, self.note)
         self.uncompiled = config.compile == "auto" and ranks.count == 1 and not config.deterministic
         self.model_images: int | None = None
         self.writer: "SummaryWriter | None" = None
@@ -214,14 +211,12 @@ class _Run:
         return result.total.item()
 
     def update(
-        self, images: Tensor, done: float, noise: Generator | None = None, rows: Tensor | None = None
+        self, images: Tensor, done: float, noise: Generator, rows: Tensor | None = None
     ) -> tuple[tuple[StepLosses, list[str], list[str]], Tensor]:
         """Change the weights by a batch: its losses, names of gradients and stages, and notes of both.
 
         Nothing here waits for the device.
         """
-        noise = self.noise if noise is None else noise
-        assert noise is not None
         self.optimiser.zero_grad(set_to_none=True)  # a recording that failed may have left some
         result = compute_step(self.module, images, noise, self.precision, done, rows)
         self.fabric.backward(result.total)
@@ -350,11 +345,9 @@ class _Run:
                 self.writer.add_scalar(f"{kind}/{name}", value, images)
 
     def note(self, text: str) -> None:
-        """Log a sentence."""
         self.log("note", {"text": text})
 
     def close(self) -> None:
-        """Finish all writing."""
         self.reader.close()
         if self.writer is not None:
             self.writer.close()

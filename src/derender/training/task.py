@@ -35,23 +35,19 @@ Losses = Callable[..., StepLosses]
 """Of one batch, from the arguments of `compute_step` after the module."""
 
 
-class Held:
-    """Hides a result from wrappers that walk through a module's output in search of tensors."""
-
-    def __init__(self, result: StepLosses):
-        self.result = result
-
-
 class Step(nn.Module):
-    """A model with the losses of its batches, as one module that a strategy may wrap."""
+    """A model with the losses of its batches, as one module that a strategy may wrap.
+
+    Wrappers search the output for tensors; the function around the result hides it from them.
+    """
 
     def __init__(self, model: nn.Module, losses: Losses):
         super().__init__()
         self.model, self.losses = model, losses
 
-    def forward(self, *batch: Any) -> tuple[Tensor, Held]:
+    def forward(self, *batch: Any) -> tuple[Tensor, Callable[[], StepLosses]]:
         result = self.losses(*batch)
-        return result.total, Held(result)
+        return result.total, lambda: result
 
 
 class TrainingTask(ABC):
@@ -74,12 +70,11 @@ class TrainingTask(ABC):
         return 1.0
 
     @abstractmethod
-    def check(self) -> None:
-        """Raise what is missing, before a run folder is made."""
-
-    @abstractmethod
     def build(self) -> nn.Module:
-        """The untrained model, the same for the same seed; its ``save(folder, overwrite=)`` writes it."""
+        """The untrained model, the same for the same seed; its ``save(folder, overwrite=)`` writes it.
+
+        It is built before there is a run folder: an error where something that the run needs is missing.
+        """
 
     @abstractmethod
     def losses(
@@ -87,9 +82,9 @@ class TrainingTask(ABC):
     ) -> Losses:
         """The losses of a batch, by which ``model`` learns; what they need is made of all images."""
 
-    @abstractmethod
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:
-        """A watcher that continues from ``memory``."""
+        """A watcher that continues from ``memory``; by default of the loss, which needs none."""
+        return FiniteWatch()
 
 
 def compute_step(
@@ -100,8 +95,8 @@ def compute_step(
 
     ``done`` is the share of the run so far, None in evaluation; ``rows`` are images' places in the data set.
     """
-    _, held = module(images, generator, precision, done, rows)
-    return held.result
+    _, result = module(images, generator, precision, done, rows)
+    return result()
 
 
 def network_precision(precision: str, device: torch.device) -> Precision:
