@@ -14,8 +14,8 @@ SIGMA_FLOOR = 1e-3
 
 
 def photometric_loss(
-    prediction: Float[Tensor, "n 3 h w"],
-    target: Float[Tensor, "n 3 h w"],
+    prediction: Float[Tensor, "n c h w"],
+    target: Float[Tensor, "n c h w"],
     mask: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
     sigma: Float[Tensor, "n 1 h w"] | None,
 ) -> Float[Tensor, ""]:
@@ -34,8 +34,8 @@ def photometric_loss(
 
 
 def masked_l1(
-    prediction: Float[Tensor, "n 3 h w"],
-    target: Float[Tensor, "n 3 h w"],
+    prediction: Float[Tensor, "n c h w"],
+    target: Float[Tensor, "n c h w"],
     mask: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
 ) -> Float[Tensor, ""]:
     """Mean absolute difference over channels and over the pixels that the mask keeps; 0 is best."""

@@ -33,10 +33,10 @@ from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import make_features
 from derender.training.step import fill_uncovered
+from derender.training.views import batches
 
 MEASURED_IMAGES = 256  # images on which standard deviations and errors are measured
 
-_FIT_BATCH = 128
 _NOISE = 0.03  # mean absolute error of a rendering that counts as much as a gap of 1
 
 
@@ -48,17 +48,14 @@ class StudentSettings(Settings):
     learning_rate: float = Field(default=4e-4, gt=0)
 
     def learn(
-        self, optimiser: torch.optim.Optimizer, loss: Callable[[Tensor], Tensor], count: int,
-        generator: Generator, report: Progress, **how: Any,
+        self, what: str, student: nn.Module, optimiser: torch.optim.Optimizer,
+        loss: Callable[[Tensor], Tensor], count: int, generator: Generator, report: Progress, **how: Any,
     ) -> None:  # fmt: skip
-        """Minimise a loss of rows of ``count`` images by `one_cycle`."""
+        """Minimise a loss of rows of ``count`` images by `one_cycle`; weights of NaN are a ValueError."""
         batch = min(self.batch_size, count)
         steps = math.ceil(self.images / batch)
         for step, _ in one_cycle(optimiser, loss, count, batch, steps, generator, **how):
             report(min(step * batch, self.images), self.images)
-
-    def check(self, student: nn.Module, what: str) -> None:
-        """Weights that are NaN or infinite are an error."""
         if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
             raise ValueError(
                 f"{what} ended in weights that are NaN or infinite after {self.images:,} images: "
@@ -134,7 +131,6 @@ def refine(
         ranges = crop.ranges_for_crops(student.settings.ranges, student.image_size, config.reframe)
         student.settings = student.settings.model_copy(update={"ranges": ranges})
     _learn(student, images[rows[clear]], maps, fitted.rows(clear), config, generator, report)
-    settings.check(student, "refining")
     fitting = config.fitting.model_copy(update={"coordinates": maps.size("depth")})
     features = config.model_copy(update={"fitting": fitting})
     student = make_features(student, images, features, seed=seed, progress=progress, maps=maps)
@@ -173,11 +169,10 @@ def fit_scenes(
     """Scenes fitted to all images, batch by batch."""
     model = model.with_brightness(None)  # coordinates are of albedos as decoded
     parts: list[dict[str, Tensor]] = []
-    for start in range(0, len(images), _FIT_BATCH):
-        result = model.fit_scenes(as_float(images[start : start + _FIT_BATCH]).to(model.device), steps)
+    for _, batch in batches(model, images, torch.arange(len(images)), report):
+        result = model.fit_scenes(batch, steps)
         own = {parameter: result.coordinates[name] for name, parameter in PARAMETERS.items()}
         parts.append({"error": result.after, **result.scene.parameters, **own})
-        report(min(start + _FIT_BATCH, len(images)), len(images))
     values = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     return FittedScenes(values, values.pop("error"))
 
@@ -207,7 +202,7 @@ def _learn(
             total = total + settings.picture_weight * error / _NOISE
         return total
 
-    settings.learn(optimiser, loss, len(images), generator, report, warm_up=0.05)
+    settings.learn("refining", student, optimiser, loss, len(images), generator, report, warm_up=0.05)
     student.requires_grad_(False).eval()
 
 
@@ -309,7 +304,6 @@ def _mean_deviation(value: Float[Tensor, "n ..."], numbers: Sequence[Number] = (
 def _compared(
     model: Derenderer, student: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Errors and gaps of a refined model."""
     model, student = model.with_brightness(None), student.with_brightness(None)
     shown = as_float(images).to(model.device)
     fitted = model.fit_scenes(shown, steps).scene

@@ -140,7 +140,6 @@ class Replayed:
         return result
 
     def _record(self, images: Tensor, done: float, phase: Any) -> None:
-        """Record the step without running it."""
         self._graph, self._phase, self._images = torch.cuda.CUDAGraph(), phase, images.clone()
         self._graph.register_generator_state(self.noise)
         try:

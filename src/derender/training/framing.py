@@ -71,8 +71,7 @@ def _examples(
                 pair = photographs(model, scene, batch, generator, 1, UNTURNED)
             for part, shown in zip(parts, pair, strict=True):
                 part.append((255 * adaptive_avg_pool2d(shown, SIDE)).round().byte().cpu())
-    plain, lit = map(torch.cat, parts)
-    return plain, lit
+    return torch.cat(parts[0]), torch.cat(parts[1])
 
 
 def drawn_crops(

@@ -21,7 +21,7 @@ from torch.nn.functional import affine_grid, grid_sample
 from derender.data import Progress, as_float
 from derender.model import Derenderer
 from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
-from derender.objectives.reconstruction import masked_mean
+from derender.objectives.reconstruction import masked_l1
 from derender.render import warp
 from derender.training.distillation import MEASURED_IMAGES, Student, StudentSettings
 
@@ -85,7 +85,6 @@ def distil_unets(
         decoders = {name: UNetDecoder(encoder.widths, 1, PIXEL_CHANNELS[name]) for name, encoder in encoders}
         heads = nn.ModuleDict(decoders).to(model.device)
     _learn(model, student, heads, images, settings, Generator().manual_seed(seed), progress)
-    settings.check(student, "the U-Nets' training")
     return Student(student, _errors(model, student, heads, images[:MEASURED_IMAGES]))
 
 
@@ -110,7 +109,6 @@ def _learn(
     model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: UInt8[Tensor, "n 3 h w"],
     settings: UNetSettings, generator: Generator, progress: Progress | None,
 ) -> None:  # fmt: skip
-    """Train the student's encoders and decoder and the heads in place."""
     joint, encoders = student.unet_decoder, _encoders(student)
     assert joint is not None
     alone = nn.ModuleList([*encoders.values(), heads])
@@ -137,15 +135,16 @@ def _learn(
         total = shown.new_zeros(())
         pieces = joined.float().split([*PIXEL_CHANNELS.values()], dim=1)
         for name, piece in zip(PIXEL_CHANNELS, pieces, strict=True):
-            total = total + masked_error(own[name].float(), maps[name], mask)
-            total = total + masked_error(piece, maps[name], mask)
+            total = total + masked_l1(own[name].float(), maps[name], mask)
+            total = total + masked_l1(piece, maps[name], mask)
             difference = codes[name].flatten(1)[:straight].float() - targets.codes[name][:straight]
             total = total + settings.code_weight * (difference / scale[name]).square().mean()
         return total
 
     parts = [alone, joint]  # each is clipped by itself: encoders learn as if there were no decoder over both
     report = progress or (lambda *_: None)
-    settings.learn(optimiser, loss, len(images), generator, report, warm_up=0.1, clipped=parts)
+    how = {"warm_up": 0.1, "clipped": parts}
+    settings.learn("the U-Nets' training", student, optimiser, loss, len(images), generator, report, **how)
     learning.eval().requires_grad_(False)
     student.eval()
 
@@ -192,28 +191,20 @@ def augmented(
     return shown, moved, (mask[:, 0] > 0.99).float()
 
 
-def masked_error(
-    predicted: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Float[Tensor, "n h w"]
-) -> Float[Tensor, ""]:
-    """Mean absolute error over channels and the pixels that the mask keeps."""
-    return masked_mean((predicted - target).abs().mean(dim=1), mask)
-
-
 @torch.no_grad()
 def _errors(
     model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: UInt8[Tensor, "n 3 h w"]
 ) -> dict[str, float]:
-    """The errors of a copy with U-Nets."""
     shown = as_float(images).to(model.device)
     targets = pixel_targets(model, shown)
     own = {name: heads[name](encoder.skips(shown)) for name, encoder in _encoders(student).items()}
     geometry, place = targets.maps["geometry"], (model.image_size - 1) / 2
     errors = {
-        "place": place * float(masked_error(own["geometry"][:, :2], geometry[:, :2], targets.mask)),
-        "depth": float(masked_error(own["geometry"][:, 2:], geometry[:, 2:], targets.mask)) / 2,
-        "albedo": float(masked_error(own["albedo"], targets.maps["albedo"], targets.mask)),
+        "place": place * float(masked_l1(own["geometry"][:, :2], geometry[:, :2], targets.mask)),
+        "depth": float(masked_l1(own["geometry"][:, 2:], geometry[:, 2:], targets.mask)) / 2,
+        "albedo": float(masked_l1(own["albedo"], targets.maps["albedo"], targets.mask)),
     }
     for title, one in (("reconstruction", student), ("reconstruction before", model)):
         seen = one.reconstruct(shown)
-        errors[title] = float(masked_error(seen.image.clamp(0, 1), shown, seen.mask))
+        errors[title] = float(masked_l1(seen.image.clamp(0, 1), shown, seen.mask))
     return errors

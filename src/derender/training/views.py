@@ -42,13 +42,9 @@ def renderings(
 
 
 def photographs(
-    model: Derenderer,
-    scene: Scene,
-    images: Float[Tensor, "n 3 h w"],
-    generator: Generator,
-    count: int,
+    model: Derenderer, scene: Scene, images: Float[Tensor, "n 3 h w"], generator: Generator, count: int,
     turns: PerturbSettings = TURNS,
-) -> list[Float[Tensor, "n 3 h w"]]:
+) -> list[Float[Tensor, "n 3 h w"]]:  # fmt: skip
     """The images, then as often in light from any side, turned by ``turns``, by another camera; all in 0..1.
 
     The images' own pixels lie on the surfaces; each is multiplied by the new shading over its own.
