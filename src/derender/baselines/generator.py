@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import log2, sqrt
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -202,22 +202,17 @@ class StyleLayer:
     """One layer that a style steers."""
 
     colour: bool  # whether it makes colours (ToRGB) or is a styled convolution
-    index: int  # which of its kind
-    code: int  # the w of W+ that it takes
+    code: int  # the w of W+ that it takes: also which of the convolutions it is, and half of it which ToRGB
     resolution: int  # of the activation that the style scales, in pixels
     channels: int  # numbers in its style
 
 
 def style_layers(settings: GeneratorSettings) -> tuple[StyleLayer, ...]:
     """Every steered layer in the order in which an image is made: style space's order."""
-    rows = [(False, 0, 0, 4), (True, 0, 1, 4)]
+    rows = [(False, 0, 4), (True, 1, 4)]
     for step, (half, size) in enumerate(pairwise(settings.resolutions)):
         code = 2 * step + 1
-        rows += [
-            (False, code, code, half),
-            (False, code + 1, code + 1, size),
-            (True, step + 1, code + 2, size),
-        ]
+        rows += [(False, code, half), (False, code + 1, size), (True, code + 2, size)]
     return tuple(StyleLayer(*row, settings.channels(row[-1])) for row in rows)
 
 
@@ -288,7 +283,7 @@ class Generator(nn.Module):
             if layer.colour:
                 image = module(maps, style, image)
             else:
-                maps = module(maps, style, None if noise is None else noise[layer.index])
+                maps = module(maps, style, None if noise is None else noise[layer.code])
         assert image is not None
         return image
 
@@ -296,5 +291,5 @@ class Generator(nn.Module):
         """An image, about -1..1, from w or W+."""
         return self.synthesise(self.styles(self.w_plus(w)), noise)
 
-    def _module(self, layer: StyleLayer) -> StyledConv | ToRgb:
-        return (self.to_rgbs if layer.colour else self.convs)[layer.index]  # pyright: ignore[reportReturnType]
+    def _module(self, layer: StyleLayer) -> Any:
+        return self.to_rgbs[layer.code // 2] if layer.colour else self.convs[layer.code]

@@ -78,7 +78,7 @@ class Ris(BaselineModel):
     settings: RisSettings
     centres: Tensor
     cluster_part: Tensor
-    matrix: Tensor
+    matrix: Tensor  # how much of each style channel belongs to each part, 0..1
 
     def __init__(self, settings: RisSettings):
         super().__init__(settings)
@@ -94,13 +94,9 @@ class Ris(BaselineModel):
         """Style space of images in 0..1."""
         return torch.cat([*self.e4e.generator.styles(self.e4e.invert(images))], dim=1)
 
-    def row(self, part: str) -> Float[Tensor, " s"]:
-        """How much of each style channel belongs to a part, 0..1."""
-        return self.matrix[self.features.index(part)]
-
     def describe(self, images: Images) -> Features:
         styles = self.styles(images)
-        return {part: styles * self.row(part) for part in self.features}
+        return {part: styles * row for part, row in zip(self.features, self.matrix, strict=True)}
 
     def rebuild(self, styles: Float[Tensor, "n s"]) -> Images:
         """Images, about 0..1, from style space."""
@@ -111,7 +107,7 @@ class Ris(BaselineModel):
     def swapped(self, images: Images, others: Images, part: str) -> Float[Tensor, "n 3 h2 w2"]:
         """Inversions of images with one part taken from others."""
         own, other = self.styles(images), self.styles(others)
-        return self.rebuild(own + self.row(part) * (other - own))
+        return self.rebuild(own + self.matrix[self.features.index(part)] * (other - own))
 
     def shown(self, images: Images) -> dict[str, Images]:
         columns = {"input": images, "inversion": self.rebuild(self.styles(images))}
@@ -135,7 +131,7 @@ class Ris(BaselineModel):
         run = ShortRun(config, images, out, resume=resume, accelerator=accelerator, **how)
         inputs, parts = inputs.to(accelerator), parts.to(accelerator)
         model = build_catalogue(e4e, inputs, parts, names, config, progress=run.note)
-        channels = {part: float(model.row(part).gt(0).sum()) for part in model.features}
+        channels = dict(zip(model.features, model.matrix.gt(0).sum(dim=1).float().tolist(), strict=True))
         run.record("train", len(inputs), channels)
         if sample_sheet is not None:
             sheet = sample_sheet(model, inputs[:SAMPLE_COUNT])

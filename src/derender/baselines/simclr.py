@@ -25,12 +25,12 @@ from derender.baselines.controls import LUMINANCE
 from derender.baselines.model import Features, Images, LoopModel, LossInputs
 from derender.model import Derenderer, load
 from derender.objectives.loocc import nt_xent
-from derender.scene.perturb import PerturbSettings, perturb_camera, perturb_light
+from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, OptimiserSettings
-from derender.training.step import fill_uncovered
 from derender.training.task import PhaseProgress
+from derender.training.views import renderings
 
 Views = Callable[[Images, Generator], Images]
 
@@ -225,10 +225,6 @@ def physical_view(
     model: Derenderer, images: Images, changes: PerturbSettings, generator: Generator
 ) -> Images:
     """Every image decomposed and re-rendered under other lighting and from another viewpoint, in 0..1."""
-    scene, ranges = model.decompose(images), model.settings.ranges
-    scene = scene.with_parameters(
-        light=perturb_light(scene.light, generator, changes, ranges),
-        camera=perturb_camera(scene.camera, generator, changes, ranges),
-    )
-    rendering = model.render(scene)
-    return fill_uncovered(rendering.image, rendering.mask, images).clamp(0, 1)
+    seen_in = [factor for factor in model.factors if factor.parameter in ("light", "camera")]
+    _, view = renderings(model, model.decompose(images), images, seen_in, changes, generator, 1)
+    return view.clamp(0, 1)

@@ -152,9 +152,8 @@ class Stylegan(LoopModel):
         if not self.training:
             small = min(JUDGED_SIDE, images.shape[-1])
             both = images.float(), self.sample(len(images), run.generator)
-            return {
-                "energy": energy_distance(*(adaptive_avg_pool2d(each, small).flatten(1) for each in both))
-            }
+            rows, sampled = (adaptive_avg_pool2d(each, small).flatten(1) for each in both)
+            return {"energy": energy_distance(rows, sampled)}
         n, net, judge, objective = len(images), self.learner, self.discriminator, run.config.objective
         self.average(n, objective.average_images)
         step, real = int(self.steps) - 1, 2 * images - 1
@@ -173,9 +172,8 @@ class Stylegan(LoopModel):
         if r1_weight and step % objective.r1_every == 0:
             terms["r1"] = r1_weight * objective.r1_every * r1_penalty(judge, real)
         if objective.path_weight and step % objective.path_every == 0:
-            lengths = path_lengths(
-                net, mixed_w(net, max(n // 2, 1), objective.mixing, run.generator), run.generator
-            )
+            half = mixed_w(net, max(n // 2, 1), objective.mixing, run.generator)
+            lengths = path_lengths(net, half, run.generator)
             self.path_length.lerp_(lengths.detach().mean(), objective.path_decay)
             penalty = (lengths - self.path_length).square().mean()
             terms["path"] = objective.path_weight * objective.path_every * penalty
