@@ -155,10 +155,9 @@ def finetune_settings(
     if isinstance(factors, str):
         factors = [name.strip() for name in factors.split(",")]
     target = {
-        "labels": list(dict.fromkeys(labels or ())) or None, "factors": factors, "weight": weight,
-        "rendering_weight": rendering_weight, "labelled": labelled,
+        "target__labels": list(dict.fromkeys(labels or ())) or None, "target__factors": factors,
+        "target__weight": weight, "target__rendering_weight": rendering_weight, "target__labelled": labelled,
     }  # fmt: skip
-    changes = {name: {f"target__{name}": value} for name, value in target.items() if value is not None}
     if resume:
         if not (Path(out) / "config.yaml").is_file():
             raise FileNotFoundError(f"no run to resume in {out} (no config.yaml): begin without resume")
@@ -167,10 +166,11 @@ def finetune_settings(
             raise ValueError(f"{out} was made by derender train: continue with derender train --resume")
         began = {"model": (model, config.start), "preset": (preset, None if config.start else config.preset)}
         differ = [name for name, (given, own) in began.items() if given is not None and str(given) != own]
-        differ += [name for name, change in changes.items() if with_changes(config, **change) != config]
+        differ += [name for name, value in target.items() if with_changes(config, **{name: value}) != config]
         differ += [text for text in texts_of(settings) if with_changes(config, [text]) != config]
         if differ:
-            raise ValueError(f"a resumed run keeps its settings: leave out {', '.join(differ)}")
+            names = ", ".join(name.removeprefix("target__") for name in differ)
+            raise ValueError(f"a resumed run keeps its settings: leave out {names}")
         return config
     if model is not None and preset is not None:
         raise ValueError("preset is for fresh weights, model for given ones: give one of them")
@@ -185,8 +185,7 @@ def finetune_settings(
         values = config.model_dump(mode="json", include=kept)
         start = as_model(model, device="cpu")
         config = FinetuneConfig(**values, model=start.settings, start=str(model))
-    every = {key: value for change in changes.values() for key, value in change.items()}
-    return with_changes(config, texts_of(settings), **every)
+    return with_changes(config, texts_of(settings), **target)
 
 
 def finetune(

@@ -8,7 +8,6 @@ NaN and infinity are looked for at every stage: a depth of NaN covers no pixel, 
 loss.
 """
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -128,10 +127,9 @@ class Watcher(FiniteWatch):
     ) -> "Watcher":
         """A watcher that continues where ``memory`` was taken, or starts anew; else a ValueError."""
         try:
-            watcher = cls(ranges, batch_size, **memory)
+            watcher = cls(ranges, batch_size, ranks=ranks, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]
             if all(type(number) in (int, float) for number in numbers):
-                watcher.ranks = ranks
                 return watcher
         except (TypeError, AttributeError):
             pass
@@ -141,8 +139,8 @@ class Watcher(FiniteWatch):
         )
 
     def memory(self) -> dict[str, Any]:
-        kept = {"averages": self.averages, "on_since": self.on_since, "last_images": self.last_images}
-        return copy.deepcopy(kept)
+        averages, on_since = dict(self.averages), dict(self.on_since)
+        return {"averages": averages, "on_since": on_since, "last_images": self.last_images}
 
     def parts(self, result: Any) -> tuple[dict[str, Tensor], list[Tensor]]:
         measured = measure(result.scene, self.ranges)
