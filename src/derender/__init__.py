@@ -31,7 +31,6 @@ _NAMES = {
     "interpretation": ("explain",),
 }
 _HOME = {name: f"derender.{module}" for module, names in _NAMES.items() for name in names}
-_ALIASES = {"evaluate": "derender.evaluation"}
 _SUBMODULES = [
     *("scene", "render", "data", "networks", "objectives", "model", "training", "photo", "features"),
     *("baselines", "evaluation", "interpretation", "report"),
@@ -49,8 +48,8 @@ def __getattr__(name: str) -> Any:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in _SUBMODULES:
         return importlib.import_module(f"derender.{name}")
-    if name in _ALIASES:
-        return importlib.import_module(_ALIASES[name])
+    if name == "evaluate":
+        return importlib.import_module("derender.evaluation")
     raise AttributeError(f"module 'derender' has no attribute {name!r}")
 
 

@@ -37,9 +37,10 @@ def is_main_process() -> bool:
     return "LOCAL_WORLD_SIZE" not in os.environ or os.environ.get("RANK", "0") == "0"
 
 
-def notice(text: str) -> None:
-    """One note for the person at the terminal."""
-    result(text, "-")
+def notice(*texts: str) -> None:
+    """Notes for the person at the terminal, each on a line of its own."""
+    for text in texts:
+        result(text, "-")
 
 
 def result(text: str, json_file: str | None) -> None:
@@ -57,9 +58,8 @@ def report_images(
     images: "ImageSet", word: str = "skipped", rest: str = "(derender doctor --json FILE names all)"
 ) -> None:
     """What was read, and the first of what was left out by name."""
-    notice(images.describe())
-    for row in images.skipped[:NAMED]:
-        notice(f"{word} {visible(row.file, '')}: {row.reason}")
+    first = (f"{word} {visible(row.file, '')}: {row.reason}" for row in images.skipped[:NAMED])
+    notice(images.describe(), *first)
     if (more := len(images.skipped) - NAMED) > 0:
         notice(f"and {more:,} more {rest}")
 

@@ -51,8 +51,7 @@ def demo(
             result("", json_file)
             values[name] = table.values()
         values |= {"run": story.trained, "seconds": story.seconds}
-        for finding in story.trained.findings:
-            notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+        notice(*(f"{one.sign}: {one.text}; {one.advice}" for one in story.trained.findings))
     notice(f"done in {duration(time.monotonic() - began)}; the model is in {folder / 'run'}")
     result(f"report {folder / 'report.html'}", json_file)
     write_json(json_file, values)

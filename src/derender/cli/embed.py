@@ -64,7 +64,7 @@ def embed(
             how |= {option: getattr(baselines, option) for option in ("image_size", "components", "seed")}
             done = derender.baselines.embed_baseline(name, images.address, out, model, **reading, **how)
     named = (f"skipped {visible(row.file, '')}: {row.reason}" for row in done.examples[:NAMED])
-    notice("\n".join([done.describe(), *named]))
+    notice(done.describe(), *named)
     sizes = ", ".join(f"{factor} {size}" for factor, size in done.factors.items())
     if name is None and (odd := unlike_training(images.address, model, **images.how)):
         notice(odd)

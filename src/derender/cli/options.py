@@ -7,9 +7,9 @@ command that reads images is one field here, used in one method here.
 """
 
 import functools
-import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 BUNDLED = ", ".join(places.bundled_models())
 MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {BUNDLED}."
 IMAGES = "Folder, zip, .tar shards or Hugging Face id; ADDRESS::PART for a part of it."
-DATASET = "Layout of the images, if it is not recognised."
 JSON = "Also write the numbers as JSON; - is standard output."
 HALF = "all, or the development or test half, by a hash of identity, model or file."
 LIMIT = "Read at most N images: evenly spaced, or the first of a stream."
@@ -40,7 +39,7 @@ OUT_IMAGES = "Folder to write to; or, of one image, a single .png, .jpg, .gif, .
 SETTING = "Change one setting; may be repeated. The reference of settings lists all."
 Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
 Images = Annotated[str | None, typer.Argument(help=IMAGES, metavar="IMAGES", show_default=False)]
-Dataset = Annotated[str, typer.Option("--dataset", help=DATASET, metavar="NAME")]
+Dataset = Annotated[str, typer.Option(help="Layout of the images, if it is not recognised.", metavar="NAME")]
 Json = Annotated[str | None, typer.Option("--json", help=JSON, metavar="FILE")]
 Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help=LIMIT)]
 BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help=BATCH)]
@@ -68,17 +67,16 @@ def command(name: str, example: str) -> Callable[[Callable[..., None]], Any]:
 def gathered(command: Callable[..., None]) -> Callable[..., None]:
     """The command with the fields of its dataclass parameters in their place, all given by name."""
     groups: dict[str, type] = {}
-    shown: list[inspect.Parameter] = []
+    shown: list[Parameter] = []
 
     def show(name: str, kind: Any, default: Any) -> None:
         if isinstance(default, Field):
             if words := dict(default.metadata):
                 kind = Annotated[kind, typer.Option(*words.pop("names"), **words)]
-            default = inspect.Parameter.empty if default.default is MISSING else default.default
-        how = {"default": default, "annotation": kind}
-        shown.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, **how))
+            default = Parameter.empty if default.default is MISSING else default.default
+        shown.append(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind))
 
-    for name, parameter in inspect.signature(command).parameters.items():
+    for name, parameter in signature(command).parameters.items():
         kind = parameter.annotation
         if isinstance(kind, type) and is_dataclass(kind):
             groups[name] = kind
@@ -95,7 +93,7 @@ def gathered(command: Callable[..., None]) -> Callable[..., None]:
         }
         command(**given, **taken)
 
-    run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    run.__signature__ = Signature(shown)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
     return run
 
@@ -259,8 +257,7 @@ class ImageFiles:
                 raise KeyboardInterrupt(
                     "stopped by Ctrl-C; finished images are kept: --resume continues"
                 ) from None
-        for note in written.notes():
-            notice(note)
+        notice(*written.notes())
         output.result(f"{places.counted(len(written.images), 'images')} in {self.out}")
         output.write(written.values())
         if set(written.refused) & set(self.images):  # of a folder others were used

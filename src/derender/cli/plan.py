@@ -39,8 +39,7 @@ def by_plan(planned: Planned, device: str, json_file: str | None) -> None:
     scores = learn.compare_plan(plan, out, device=device, tell=notice, bar=progress_bar)
     for table in scores.tables[: scores.values["summaries"]]:
         show_scores(table, json_file)
-    for sentence in scores.values["failed"]:
-        notice(f"failed: {sentence}")
+    notice(*(f"failed: {sentence}" for sentence in scores.values["failed"]))
     for file in scores.values["files"]:
         result(str(file), json_file)
     write_json(json_file, scores.values)

@@ -41,7 +41,6 @@ def report(
     else:
         notice("add images for decompositions, films, scores, the disentanglement card and explanations")
     page = run_page(run, evidence).write(out or run / "report.html")
-    for reason in evidence.failed:
-        notice(f"not on the page: {reason}")
+    notice(*(f"not on the page: {reason}" for reason in evidence.failed))
     output.result(f"report {page}")
     output.write({"report": page, "failed": evidence.failed})

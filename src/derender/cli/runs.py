@@ -59,8 +59,7 @@ def run_progress() -> Iterator[dict[str, Any]]:
 
 def report_run(run: "TrainResult") -> None:
     """Note how a run ended."""
-    for finding in run.findings:
-        console.notice(f"{finding.sign}: {finding.text}; {finding.advice}")
+    console.notice(*(f"{one.sign}: {one.text}; {one.advice}" for one in run.findings))
     if run.stopped == "collapse":
         console.notice("training on is pointless: the last good checkpoint and model are kept, if any")
     took = f"{console.duration(run.seconds)}, {run.waiting:.1%} of it waiting for data"

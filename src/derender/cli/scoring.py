@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Option
 
 from derender.cli import options
 from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores
@@ -21,19 +21,16 @@ number = partial(option, min=1, metavar="N")
 share = partial(option, min=0.01, max=0.99)
 target = partial(option, None, metavar="FILE")
 
-Method = Annotated[Literal["ward", "finch", "k-means"], typer.Option(help="Clustering method.")]
-Factors = Annotated[str, typer.Option(help="Features to use, with commas between, or all.")]
-Counts = Annotated[str, typer.Option(help="Numbers of labelled rows to learn from, with commas between.")]
-UNTRAINED = "Number of untrained encoders averaged."
-UntrainedSeeds = Annotated[int, typer.Option(min=1, metavar="N", help=UNTRAINED)]
-RESAMPLES = "Number of bootstrap resamples of the rows."
-Resamples = Annotated[int, typer.Option(min=2, metavar="N", help=RESAMPLES)]
-GROUPS = "Label whose rows stay on one side of the split, as identity."
-Groups = Annotated[str | None, typer.Option(help=GROUPS)]
+Method = Annotated[Literal["ward", "finch", "k-means"], Option(help="Clustering method.")]
+Factors = Annotated[str, Option(help="Features to use, with commas between, or all.")]
+Counts = Annotated[str, Option(help="Numbers of labelled rows to learn from, with commas between.")]
+UntrainedSeeds = Annotated[int, Option(min=1, metavar="N", help="Number of untrained encoders averaged.")]
+Resamples = Annotated[int, Option(min=2, metavar="N", help="Number of bootstrap resamples of the rows.")]
+Groups = Annotated[str | None, Option(help="Label whose rows stay on one side of the split, as identity.")]
 CACHE = "Folder of cached results, or none; default: the user's."
-Cache = Annotated[str | None, typer.Option(metavar="DIR", help=CACHE)]
+Cache = Annotated[str | None, Option(metavar="DIR", help=CACHE)]
 MASKS = "Folder or zip of masks named as the images, if they lie apart."
-Masks = Annotated[str | None, typer.Option(metavar="PATH", help=MASKS)]
+Masks = Annotated[str | None, Option(metavar="PATH", help=MASKS)]
 MODEL = f"Instead of --features, with IMAGES. {options.MODELS}"
 
 
@@ -112,8 +109,7 @@ class Published(options.Output):
             scores = replace(scores, tables=tables)
         for table in tables:
             show_scores(table, self.json_file)
-        for note in notes:
-            notice(note)
+        notice(*notes)
         self.write(values)
         for file, form in ((self.markdown, scores.to_markdown), (self.latex, scores.to_latex)):
             if file is not None:

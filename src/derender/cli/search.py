@@ -57,13 +57,7 @@ def search(
         from derender.report.protocols import search_sheet
 
         with progress_bar("finding images") as report:
-            for name in search_sheet(match, out, data, dataset=dataset, progress=report):
-                notice(f"left out of the sheet: {name} cannot be read")
-        notice(f"drawn in {out}")
-    output.write(
-        {
-            "like": like, "factor": factor, "metric": metric, "table": features, "out": out,
-            "same_picture": [files[row] for row in match.same_image],
-            "found": near,
-        }
-    )  # fmt: skip
+            left_out = search_sheet(match, out, data, dataset=dataset, progress=report)
+        notice(*(f"left out of the sheet: {name} cannot be read" for name in left_out), f"drawn in {out}")
+    asked = {"like": like, "factor": factor, "metric": metric, "table": features, "out": out}
+    output.write({**asked, "same_picture": [files[row] for row in match.same_image], "found": near})

@@ -59,8 +59,7 @@ def view(
         )  # fmt: skip
         if not is_loopback(host):
             notes.append(f"warning: anyone who can reach {host} can use this page, and there is no password")
-        for note in notes:
-            notice(note)
+        notice(*notes)
         url, port = address_of(listener, host), listener.getsockname()[1]
         result(f"open {url} (Ctrl-C ends)", json_file)
         write_json(json_file, {"url": url, "host": host, "port": port, "model": model.model})

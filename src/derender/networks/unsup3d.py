@@ -32,9 +32,6 @@ MOST_UNKNOWN = 50
 class Empty:
     """Stands for an object that is not read: takes anything, does nothing."""
 
-    def __new__(cls, *_: Any, **__: Any) -> "Empty":
-        return super().__new__(cls)
-
     def __init__(self, *_: Any, **__: Any) -> None:
         pass
 

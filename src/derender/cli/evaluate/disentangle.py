@@ -15,15 +15,12 @@ class CardImages(options.PartOfImages):
     limit: options.Limit = 2000
 
 
-DIMENSIONS = "Scores by dimension: lasso or none."
-
-
 def disentangle(
     images: CardImages, trained: options.TrainedModel, published: scoring.Published,
     out: Path | None = option(None, "PNG file for all matrices.", "--out", "-o", metavar="FILE.png"),
     seeds: int = scoring.number(3, "Number of seeds.", max=20),
     swap_pictures: int = scoring.number(256, "Most images in the swap test.", min=2),
-    dimensions: Literal["lasso", "none"] = option("lasso", DIMENSIONS),
+    dimensions: Literal["lasso", "none"] = option("lasso", "Scores by dimension: lasso or none."),
     batch_size: options.BatchSize = 64, seed: options.Seed = 0, cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""

@@ -8,7 +8,6 @@ from derender.cli import options, scoring
 from derender.cli.options import option
 
 PICTURES = "faces or cars: generated. render: IMAGES, re-rendered. truth: IMAGES of known angles."
-OUT = "Also draw the curves: .svg, .png."
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ def robustness(
     axes: str = option("yaw,light", "yaw, pitch, light, light-pitch; with commas."),
     angles: str = option("0,15,30,45,60,75", "Growing degrees off the front."),
     score: Literal["accuracy", "balanced"] = option("accuracy", "The score shown; --json has both."),
-    out: Path | None = option(None, OUT, "--out", "-o", metavar="FILE"),
+    out: Path | None = option(None, "Also draw the curves: .svg, .png.", "--out", "-o", metavar="FILE"),
 ) -> None:  # fmt: skip
     """Does a probe learned in ordinary light and view hold in others? Curves over angles, area 1 is best.
 
