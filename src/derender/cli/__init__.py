@@ -20,7 +20,6 @@ from derender.cli import (
     copies,
     decompose,
     demo,
-    distil,
     doctor,
     edits,
     embed,
@@ -73,7 +72,7 @@ def _options(
 
 
 for one in (
-    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, distil.refine, distil.unet,
+    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, copies.refine, copies.unet,
     models.pack, embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint,
     compare.compare, models.models, report.report, decompose.decompose, edits.relight, edits.rotate,
     edits.swap, decompose.mesh, search.search, view.view, synth, bench.bench,

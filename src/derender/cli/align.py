@@ -1,5 +1,6 @@
 """`derender align`: the faces of photographs, cut out upright as models of faces take them."""
 
+import derender
 from derender.cli.console import progress_bar
 from derender.cli.options import DataOptions, OutFolder, Output, command, option
 
@@ -24,8 +25,6 @@ def align(
     boxes.csv names each box, rejected ones with the reason, and the transform from the crop's pixels to the
     photograph's. A stopped run continues when the command is given again.
     """
-    import derender
-
     with progress_bar("searching", "photographs") as report:
         done = derender.align(
             photos.address, out, model=model, size=size, margin=margin, largest=largest, keep=keep,

@@ -1,52 +1,55 @@
-"""`derender whiten`, and the part it shares with refine and unet: a copy of a model, changed by images."""
+"""`derender whiten`, `refine` and `unet`: copies of a model, changed by images."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
-from typer import Exit
-
-from derender.cli.console import notice, progress_bar, refuse_existing, report_images
-from derender.cli.options import OutModel, Output, PartOfImages, Seed, Settings, TrainedModel, command
-from derender.cli.runs import DryRun, dry_run_shown
-
-
-def copied(
-    make: Callable[..., Any], doing: str, images: PartOfImages, model: TrainedModel, out: Path,
-    output: Output, settings: list[str] | None, dry_run: bool, **more: Any,
-) -> dict[str, Any]:  # fmt: skip
-    """Make and report a copy by a call of `derender.learn`; gives its measurements by name."""
-    from derender import learn
-
-    if dry_run:
-        dry_run_shown(learn.copy_settings(make.__name__, settings or ()), output.json_file)
-        raise Exit
-    refuse_existing(out, output.force)
-    with progress_bar(doing) as report:
-        made = make(
-            model.model, images.address, out=out, settings=settings or (), device=model.device,
-            overwrite=output.force, **images.how, on_images=report_images, progress=report, **more,
-        )  # fmt: skip
-    output.result(f"model {made.folder}")
-    output.write(made.values())
-    return made.scores
+from derender import learn
+from derender.cli.console import notice
+from derender.cli.options import Copying, OutModel, Output, PartOfImages, TrainedModel, command
 
 
 @command("whiten", "whiten photos/ --model rendered-faces-64 --out mine")
-def whiten(
-    images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, settings: Settings = None,
-    seed: Seed = 0, dry_run: DryRun = False,
-) -> None:  # fmt: skip
+def whiten(images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, how: Copying) -> None:
     """Write a copy of a model whose features move as little as possible with other factors.
 
     They are estimated on these images, without labels, and so is how albedo and lighting share brightness.
     Weights and reconstructions stay as they are. Training ends with this by itself. With --set steps=20
     features also hold scenes optimised for each image by rendering.
     """
-    from derender import learn
-
-    scores = copied(learn.whiten, "re-rendering", images, model, out, output, settings, dry_run, seed=seed)
+    scores = how.make(learn.whiten, "re-rendering", images, model, out, output)
     for name, ratios in scores["between_over_within"].items():
         clear = sum(ratio > 1 for ratio in ratios)
         differ = f"in {clear} images differ more than one does where other factors change"
         notice(f"{name}: {len(ratios)} directions kept; {differ}")
+
+
+@command("refine", "refine photos/ --model runs/mine --part train --out refined")
+def refine(images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, how: Copying) -> None:
+    """Write a copy of a model that predicts at once the scenes that test-time optimisation finds slowly.
+
+    Scenes are optimised for these images once, without labels. The encoders then learn to predict them from
+    the images and from renderings under other lighting and viewpoints (knowledge distillation). Errors are
+    measured on every tenth image, which is held out.
+    """
+    scores = how.make(learn.refine, "refining", images, model, out, output)
+    errors = scores["errors"]
+    notice(
+        f"{scores['held_out']} held-out images: reconstructed with an error of {errors['now']:.4f}, before "
+        f"{errors['before']:.4f}, fitted {errors['fitted']:.4f}"
+    )
+    for name, gap in scores["gaps"].items():
+        away = f"{gap['now']:.2f} mean deviations away from fitted scenes"
+        notice(f"{name}: {away}, before {gap['before']:.2f}")
+
+
+@command("unet", "unet photos/ --model faces-64 --out faces-unet")
+def unet(images: PartOfImages, model: TrainedModel, out: OutModel, output: Output, how: Copying) -> None:
+    """Write a copy of a model with U-Net encoders that learn its scenes pixel by pixel, without labels.
+
+    The encoders of geometry and albedo are exchanged; light, camera, decoders and confidence stay. The copy
+    is for derender evaluate segment, and decomposes images, too.
+    """
+    scores = how.make(learn.unet, "distilling", images, model, out, output)
+    errors = scores["errors"]
+    notice(
+        f"mean errors against {model.model}: place {errors['place']:.2f} pixels, depth {errors['depth']:.1%} "
+        f"of its range, albedo {errors['albedo']:.3f}; reconstruction {errors['reconstruction']:.4f}, before "
+        f"{errors['reconstruction before']:.4f}"
+    )

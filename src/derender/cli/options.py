@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from derender.cli.console import notice, progress_bar, report_images, result, write_json
+from derender import learn
+from derender.cli.console import notice, progress_bar, refuse_existing, report_images, result, write_json
+from derender.cli.runs import DryRun, dry_run_shown
 from derender.report.options import ImageOptions, option, single_suffix
 from derender.storage import places
 
@@ -203,6 +205,34 @@ class ImageModel(TrainedModel):
     """The trained model of a command for photographs."""
 
     model: Model = "faces-64"
+
+
+@dataclass(frozen=True)
+class Copying:
+    """How a copy of a model is made."""
+
+    settings: Settings = None
+    seed: Seed = 0
+    dry_run: DryRun = False
+
+    def make(
+        self, make: Callable[..., Any], doing: str, images: PartOfImages, model: TrainedModel, out: Path,
+        output: Output,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Make and report it by a call of `derender.learn`; gives its measurements by name."""
+        settings = self.settings or ()
+        if self.dry_run:
+            dry_run_shown(learn.copy_settings(make.__name__, settings), output.json_file)
+            raise typer.Exit
+        refuse_existing(out, output.force)
+        with progress_bar(doing) as report:
+            made = make(
+                model.model, images.address, out=out, settings=settings, seed=self.seed, device=model.device,
+                overwrite=output.force, **images.how, on_images=report_images, progress=report,
+            )  # fmt: skip
+        output.result(f"model {made.folder}")
+        output.write(made.values())
+        return made.scores
 
 
 @dataclass(frozen=True)

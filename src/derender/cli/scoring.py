@@ -13,7 +13,6 @@ from derender.cli.console import notice, progress_bar, refuse_existing_file, sho
 from derender.cli.options import option
 
 if TYPE_CHECKING:
-    from derender.evaluation.feature_rows import FeatureSource
     from derender.evaluation.score_table import Scores
 
 number = partial(option, min=1, metavar="N")
@@ -54,18 +53,18 @@ class ScoredSubject:
     model: str | None = option(None, MODEL, "--model", "-m")
     factors: Factors = "geometry,albedo"
 
-    def source(self, images: options.DataOptions) -> "FeatureSource":
-        """The table, or the half of it that was asked for, or the model."""
+    def score(self, protocol: str, images: options.DataOptions, published: "Published", **how: Any) -> None:
+        """Score by a protocol of `derender.evaluation`, and publish."""
         from derender.data import half_of
         from derender.features import FeatureTable
 
+        how |= {"images": images.optional_address, **images.how, "factors": names_of(self.factors)}
         if (self.features is None) == (self.model is None):
             raise ValueError("give either --features FILE, or --model M with IMAGES")
-        if self.model is None:
-            return half_of(FeatureTable.read(str(self.features)), images.half)
-        if images.optional_address is None:
+        if self.model is not None and images.optional_address is None:
             raise ValueError("--model needs IMAGES to embed")
-        return self.model
+        source = self.model or half_of(FeatureTable.read(str(self.features)), images.half)
+        published.publish(measured(protocol, source, **how), half=images.half)
 
 
 @dataclass(frozen=True)
@@ -129,14 +128,6 @@ def measured(protocol: str, *given: Any, doing: str = "scoring", unit: str = "im
 
     with progress_bar(doing, unit) as progress:
         return getattr(evaluation, protocol)(*given, **how, progress=progress)
-
-
-def score(
-    protocol: str, published: Published, images: options.DataOptions, subject: ScoredSubject, **how: Any
-) -> None:
-    """Score features by a protocol of `derender.evaluation`, and publish."""
-    how |= {"images": images.optional_address, **images.how, "factors": names_of(subject.factors)}
-    published.publish(measured(protocol, subject.source(images), **how), half=images.half)
 
 
 def names_of(text: str) -> tuple[str, ...] | None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from derender import learn
 from derender.cli.console import is_main_process, notice, result, write_json
 from derender.cli.options import DataOptions, Device, Json, Settings, command, option
 from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run, run_progress
@@ -38,8 +39,6 @@ def train(
     settings: Settings = None, dry_run: DryRun = False, json_file: Json = None,
 ) -> None:  # fmt: skip
     """Learn to decompose images from a folder of unlabelled images of one kind of object."""
-    from derender import learn
-
     changes = [*(settings or ()), *([] if generator is None else [f"generator={generator}"])]
     config = learn.run_settings(out, settings=changes, **vars(chosen))
     asked = chosen.preset or chosen.config or chosen.resume

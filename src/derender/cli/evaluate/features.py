@@ -20,7 +20,7 @@ def cluster(
     """Do features group images by a label that training never saw? 1 is best."""
     own = {"method": method, "clusters": clusters, "mean_by": mean_by or ()}
     own |= {"untrained_seeds": untrained_seeds}
-    scoring.score("cluster", published, images, subject, **vars(labels), **vars(computed), **own)
+    subject.score("cluster", images, published, **vars(labels), **vars(computed), **own)
 
 
 def linear(
@@ -37,7 +37,7 @@ def linear(
     own = {"counts": scoring.numbers_of(counts, "--counts"), "heads": scoring.names_of(heads) or ()}
     own |= {"seeds": seeds, "test_fraction": test_fraction, "groups": groups}
     own |= {"finetune": finetune, "epochs": epochs, "untrained_seeds": untrained_seeds}
-    scoring.score("linear", published, images, subject, **vars(labels), **vars(computed), **own)
+    subject.score("linear", images, published, **vars(labels), **vars(computed), **own)
 
 
 def identify(
@@ -57,7 +57,7 @@ def identify(
     """
     own = {"label": label, "by": by, "bins": scoring.numbers_of(bins, "--bins"), "gallery": gallery}
     own |= {"centred": centred, "cluster_within": cluster_within, "untrained_seeds": untrained_seeds}
-    scoring.score("identify", published, images, subject, **vars(computed), **own)
+    subject.score("identify", images, published, **vars(computed), **own)
 
 
 def verify(
@@ -68,4 +68,4 @@ def verify(
 ) -> None:  # fmt: skip
     """Do two photographs show one person? Accuracy over the folds of LFW's protocol, and AUC; 1 is best."""
     own = {"pairs": pairs, "half": images.half, "untrained_seeds": untrained_seeds}
-    scoring.score("verify", published, images, subject, **vars(computed), **own)
+    subject.score("verify", images, published, **vars(computed), **own)
