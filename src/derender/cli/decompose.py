@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, opener_of, option
+from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, option
 from derender.report.options import MESH_FORMATS, MESH_SIZE, TEXTURE_SIZE, ImageOptions
 from derender.storage.places import require_known
 
@@ -15,7 +15,7 @@ def decompose(
     """Write a folder per image: panel.png, one PNG per factor, scene.json and scene.npz."""
     from derender.report.decomposition import decomposed
 
-    opener = opener_of(model, how, default_detail="model")
+    opener = model.opener(how, default_detail="model")
     files.edit(opener, partial(decomposed, opener.model), output, sheet=sheet)
 
 
@@ -29,6 +29,6 @@ def mesh(
     require_known("format", form, MESH_FORMATS)
     from derender.report.mesh import image_mesh
 
-    opener = opener_of(model, how, MESH_SIZE if how.detail == "model" else TEXTURE_SIZE)
+    opener = model.opener(how, MESH_SIZE if how.detail == "model" else TEXTURE_SIZE)
     edit = partial(image_mesh, opener.model, grazing_deg=grazing, form=form)
     files.edit(opener, edit, output, sheet=False)

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, opener_of, option
+from derender.cli.options import ImageFiles, ImageModel, ImageOutput, command, option
 from derender.report.options import EDIT_SIZE, FilmOptions, ImageOptions
 
 FACTOR = "Factor to take; may be repeated. By default each in turn."
@@ -25,7 +25,7 @@ def relight(
     """
     from derender.report.edits import relit, relit_video
 
-    opener = opener_of(model, how, EDIT_SIZE, whole=True)
+    opener = model.opener(how, EDIT_SIZE, whole=True)
     others = [] if like is None else [opener.open(like)]
     moves: dict[str, Any] = {"reach_deg": reach, "pitch_deg": pitch, "strength": strength}
     moves["like"] = others[0] if others else None
@@ -43,7 +43,7 @@ def rotate(
     """Write strips and films of images rotated from one side to the other, in their own lighting."""
     from derender.report.edits import rotated, rotated_video
 
-    opener = opener_of(model, how, EDIT_SIZE, whole=True)
+    opener = model.opener(how, EDIT_SIZE, whole=True)
     moves = {"reach_deg": reach, "pitch_deg": pitch}
     edit = partial(rotated, opener.model, **moves, film=film.single(files.suffix))
     files.edit(opener, edit, output, video=rotated_video(**moves, hold=film.hold))
@@ -60,7 +60,7 @@ def swap(
     from derender.report.edits import swappable, swapped_factors, swapped_video
     from derender.report.opening import image_files
 
-    opener = opener_of(model, how, EDIT_SIZE, whole=True)
+    opener = model.opener(how, EDIT_SIZE, whole=True)
     parameters = swappable(opener.model, factor or ())
     if files.suffix and len(parameters) > 1:
         raise ValueError(f"{files.out} is a single file, which shows one factor: add --factor NAME")

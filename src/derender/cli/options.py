@@ -193,11 +193,11 @@ class TrainedModel:
         if not places.hub_id(self.model):
             places.model_folder(self.model)
 
-    def open(self, fit_steps: int | None = None) -> "Derenderer":
+    def open(self) -> "Derenderer":
         """Load it."""
         from derender.inputs import as_model
 
-        return as_model(self.model, device=self.device, fit_steps=fit_steps)
+        return as_model(self.model, device=self.device)
 
 
 @dataclass(frozen=True)
@@ -205,6 +205,13 @@ class ImageModel(TrainedModel):
     """The trained model of a command for photographs."""
 
     model: Model = "faces-64"
+
+    def opener(self, how: ImageOptions, default_size: int = 0, **more: Any) -> "ImageOpener":
+        """What opens images: the loaded model with the options."""
+        from derender.report.opening import ImageOpener, held_out_errors
+
+        held_out = held_out_errors(self.model)
+        return ImageOpener(self.open(), how, default_size=default_size, held_out=held_out, **more)
 
 
 @dataclass(frozen=True)
@@ -292,11 +299,3 @@ class ImageFiles:
         output.write(written.values())
         if set(written.refused) & set(self.images):  # of a folder others were used
             raise typer.Exit(2)
-
-
-def opener_of(model: TrainedModel, how: ImageOptions, default_size: int = 0, **more: Any) -> "ImageOpener":
-    """What opens images: the loaded model with the options."""
-    from derender.report.opening import ImageOpener, held_out_errors
-
-    held_out = held_out_errors(model.model)
-    return ImageOpener(model.open(), how, default_size=default_size, held_out=held_out, **more)

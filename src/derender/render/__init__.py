@@ -20,15 +20,8 @@ from derender.scene.camera import constant, project, to_camera, unproject
 from derender.scene.scene import Scene
 
 __all__ = [
-    "Rendering",
-    "available_backends",
-    "chosen_backend",
-    "render",
-    "render_scene",
-    "shade",
-    "unwarp",
-    "warp",
-]
+    "Rendering", "available_backends", "chosen_backend", "render", "render_scene", "shade", "unwarp", "warp",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,6 @@ def backward(grad, depth, albedo, lamp, focal, grad_depth, grad_albedo, grad_lam
     for n in range(start, stop):
         ambient, diffuse, light_x, light_y, light_z = lamp[n]
         grad_depth[n] = 0
-        grad_lamp[n] = 0
         sums[:] = 0
         for i in range(height):
             v = kind(i - (height - 1) / 2)
@@ -118,7 +117,4 @@ def backward(grad, depth, albedo, lamp, focal, grad_depth, grad_albedo, grad_lam
                 out_below[j] += share * above[j]
                 out_above[j] -= share * below[j]
         for k in range(5):
-            total = 0.0
-            for j in range(width):
-                total += sums[k, j]
-            grad_lamp[n, k] = total
+            grad_lamp[n, k] = sums[k].astype(np.float64).sum()
