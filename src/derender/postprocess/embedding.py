@@ -66,8 +66,7 @@ class Features:
 
     def framing(self, factor: str) -> Framing | None:
         """What finds the crops that a factor's feature is made of, if it is."""
-        whitening = self.whitening
-        return whitening.framing if whitening is not None and factor in whitening.mirrored else None
+        return self.whitening.framing if self.whitening is not None and self.mirrors(factor) else None
 
     def __call__(
         self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]

@@ -38,8 +38,8 @@ class BrightnessPrior(Settings):
         weights = torch.linalg.lstsq(chroma - centre, (product - product.mean())[:, None]).solution[:, 0]
         red, blue = weights.tolist()
         offset = float(weights @ centre)
-        means = (float(value.mean()) - offset for value in (luminance, product))
-        return cls(red=red, blue=blue, **dict(zip(("albedo", "product"), means, strict=True)))
+        own, both = (float(value.mean()) - offset for value in (luminance, product))
+        return cls(red=red, blue=blue, albedo=own, product=both)
 
     def __call__(self, scene: Scene) -> Scene:
         """The scene with the same rendering, whose albedo is as bright as expected."""

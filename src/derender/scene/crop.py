@@ -133,10 +133,8 @@ def ranges_for_crops(ranges: SceneRanges, width: int, settings: CropSettings) ->
     focal = focal_px(width, ranges.fov_deg) * 2 / width
     away = max(settings.farther - 1, 1 - 1 / settings.nearer) / _REACH
     aside = math.sqrt(2) * settings.shift * settings.farther / focal / _REACH
-    needed = {"translation_xy": aside, "translation_z": away}
-    return ranges.model_copy(
-        update={name: max(getattr(ranges, name), value) for name, value in needed.items()}
-    )
+    wider = {"translation_xy": max(ranges.translation_xy, aside)}
+    return ranges.model_copy(update=wider | {"translation_z": max(ranges.translation_z, away)})
 
 
 SIDES = (0.9, 0.8, 0.7, 0.6, 0.5)

@@ -35,7 +35,5 @@ def _relative_slope(depth: Tensor, axis: int) -> Tensor:
     previous, following = depth.narrow(axis, 0, size - 1), depth.narrow(axis, 1, size - 1)
     first = (following.narrow(axis, 0, 1) - previous.narrow(axis, 0, 1)) / following.narrow(axis, 0, 1)
     last = (following.narrow(axis, -1, 1) - previous.narrow(axis, -1, 1)) / previous.narrow(axis, -1, 1)
-    if size == 2:
-        return torch.cat((first, last), axis)
     before, after = depth.narrow(axis, 0, size - 2), depth.narrow(axis, 2, size - 2)
     return torch.cat((first, (after - before) / (after + before), last), axis)
