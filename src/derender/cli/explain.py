@@ -1,6 +1,6 @@
 """`derender explain`: which factor made an answer, and where in the image it was seen."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from derender.cli import options, scoring
@@ -62,4 +62,4 @@ def explain(
         with progress_bar("drawing maps", "labels") as report:
             results = write_explanation(results, out, sheets=sheets, rows=rows, progress=report)
         published.result(f"report {out / 'explain.html'}")
-    published.publish(replace(results.scores, values={**results.scores.values, "out": out}))
+    published.publish(results.scores, out=out)

@@ -61,9 +61,11 @@ class ScoredSubject:
         how |= {"images": images.optional_address, **images.how, "factors": names_of(self.factors)}
         if (self.features is None) == (self.model is None):
             raise ValueError("give either --features FILE, or --model M with IMAGES")
-        if self.model is not None and images.optional_address is None:
+        source: Any = self.model
+        if source is None:
+            source = half_of(FeatureTable.read(str(self.features)), images.half)
+        elif images.optional_address is None:
             raise ValueError("--model needs IMAGES to embed")
-        source = self.model or half_of(FeatureTable.read(str(self.features)), images.half)
         published.publish(measured(protocol, source, **how), half=images.half)
 
 
@@ -154,11 +156,3 @@ def named_paths(values: Sequence[str], option: str) -> dict[str, list[str]]:
             raise ValueError(f"{option} {value!r} should read NAME=PATH")
         result.setdefault(name, []).append(path)
     return result
-
-
-def single_paths(values: Sequence[str], option: str) -> dict[str, str]:
-    """The same where each name is given once."""
-    result = named_paths(values, option)
-    if twice := [name for name, paths in result.items() if len(paths) > 1]:
-        raise ValueError(f"two models have the name {twice[0]!r}: give each its own")
-    return {name: path for name, (path,) in result.items()}

@@ -43,10 +43,14 @@ def robustness(
     """
     published.check_drawing(out, [".svg", ".png"])
     shown = "balanced_accuracy" if score == "balanced" else score
+    models = scoring.named_paths(model, "--model")
+    if twice := [name for name, paths in models.items() if len(paths) > 1]:
+        raise ValueError(f"two models have the name {twice[0]!r}: give each its own")
     scores = scoring.measured(
-        "robustness", scoring.single_paths(model, "--model"), images.optional_address, **images.how,
-        **vars(trial), **vars(labels), **vars(computed), score=shown, axes=scoring.names_of(axes) or (),
-        angles=scoring.numbers_of(angles, "--angles"), factors=scoring.names_of(factors),
+        "robustness", {name: path for name, (path,) in models.items()}, images.optional_address,
+        **images.how, **vars(trial), **vars(labels), **vars(computed), score=shown,
+        axes=scoring.names_of(axes) or (), angles=scoring.numbers_of(angles, "--angles"),
+        factors=scoring.names_of(factors),
     )  # fmt: skip
     published.publish(scores, models=model)
     if out is not None:
