@@ -148,9 +148,7 @@ def test_what_makes_no_sense_is_named(plain, images):
 
 def test_views_that_keep_the_images_own_pixels(plain, images):
     grain = torch.randn(6, 1, 32, 32, generator=torch.Generator().manual_seed(0)).repeat_interleave(2, 2)
-    batch = (images[:6] / 255 + 0.1 * grain.repeat_interleave(2, 3)).clamp(
-        0, 1
-    )  # finer than the model renders
+    batch = (images[:6] / 255 + 0.1 * grain.repeat_interleave(2, 3)).clamp(0, 1)  # finer than renderings
     scene = plain.decompose(batch)
     shown = photographs(plain, scene, batch, torch.Generator().manual_seed(3), 2)
     again = photographs(plain, scene, batch, torch.Generator().manual_seed(3), 2)
