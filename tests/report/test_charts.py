@@ -10,16 +10,10 @@ from derender.data import MASK_CLASSES
 from derender.evaluation.bootstrap import ScoredRow, estimate, with_verdicts
 from derender.evaluation.robust import CurveResult, RobustnessComparison
 from derender.evaluation.score_table import Column, Row, ScoreTable
+from derender.report import protocols
 from derender.report.charts import Matrix, card_matrices, matrix_sheet, side_by_side
 from derender.report.panel import GridLayout
-from derender.report.protocols import (
-    OPACITY,
-    chart_of,
-    comparison_page,
-    overlays,
-    palette,
-    segmentation_sheet,
-)
+from derender.report.protocols import OPACITY, chart_of, comparison_page, overlays, segmentation_sheet
 
 EVIL = "<script>alert(1)</script>"
 
@@ -87,9 +81,9 @@ def test_tables_say_what_was_learned_tested_and_lost():
 
 
 def test_every_class_has_a_colour_of_its_own():
-    colours = palette(40)
+    colours = protocols.palette(40)
     assert colours.shape == (40, 3) and len({tuple(row) for row in colours.tolist()}) == 40
-    faces = palette(len(MASK_CLASSES)).astype(int)
+    faces = protocols.palette(len(MASK_CLASSES)).astype(int)
     apart = np.abs(faces[:, None] - faces[None]).sum(axis=-1) + 999 * np.eye(len(faces))
     assert apart.min() > 60
 
@@ -101,7 +95,7 @@ def test_an_overlay_is_the_picture_under_the_classes_colour():
     pixels = np.asarray(image).astype(float)
     assert image.size == (6, 6)
     for (row, column), number in np.ndenumerate(masks[0]):
-        expected = (1 - OPACITY) * 100 + OPACITY * palette(4)[number]
+        expected = (1 - OPACITY) * 100 + OPACITY * protocols.palette(4)[number]
         assert np.abs(pixels[3 * row : 3 * row + 3, 3 * column : 3 * column + 3] - expected).max() <= 1
 
 
@@ -114,7 +108,7 @@ def test_the_sheet_has_a_column_for_each_answer_and_the_legend_below():
     assert sheet.width == 20 + 4 * 40 + 3 * 4
     below = np.asarray(sheet)[2 * 10 + 12 + 4 + 2 * 40 + 4 :]
     colours = {tuple(row) for row in below.reshape(-1, 3).tolist()}
-    assert {tuple(row) for row in palette(19).tolist()} <= colours
+    assert {tuple(row) for row in protocols.palette(19).tolist()} <= colours
 
 
 def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():
