@@ -58,7 +58,8 @@ def test_the_unchanged_scene_gives_the_film_back_with_its_sound(film, tmp_path):
     assert jumps[0] < 0.5 * raw
 
 
-def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd):
+def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr("derender.cli.console.PLAIN_LINE_EVERY_SECONDS", 3600)
     words = ["relight", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "out"), "--hold"]
     assert main(words) == 0
     change = np.abs(read(tmp_path / "out" / "film" / "film.mp4").astype(int) - read(film))

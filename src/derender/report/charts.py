@@ -23,7 +23,7 @@ from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
 from derender.evaluation.disentanglement.card import DisentanglementCard
-from derender.report.page import png_bytes
+from derender.report.colours import png_bytes
 from derender.storage.atomic import write_whole
 
 SERIES = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#64748b")

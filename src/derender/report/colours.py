@@ -4,6 +4,9 @@ Every function takes one array for a whole set and uses one range for all of it:
 compared. Leaves out layout (see ``panel``) and anything that needs a model.
 """
 
+from io import BytesIO
+from typing import Any
+
 import cv2
 import numpy as np
 from PIL import Image
@@ -97,3 +100,15 @@ def enlarged(image: Image.Image, width: int) -> Image.Image:
     """The image at ``width`` pixels, aspect kept, by bicubic interpolation (smooth) in either direction."""
     height = max(1, round(image.height * width / image.width))
     return image.resize((width, height), Image.Resampling.BICUBIC)
+
+
+def image_bytes(image: Image.Image, form: str = "PNG", **how: Any) -> bytes:
+    """The file of an image; ``how`` are Pillow's words for that form."""
+    stream = BytesIO()
+    image.save(stream, format=form, **how)
+    return stream.getvalue()
+
+
+def png_bytes(image: Image.Image) -> bytes:
+    """A compact PNG file."""
+    return image_bytes(image, optimize=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -23,9 +23,6 @@ from derender.photo import edit_video, is_video
 from derender.photo.faces import TEMPLATES
 from derender.photo.video import Edit as VideoEdit
 from derender.report.colours import enlarged
-from derender.report.decomposition import Decomposition
-from derender.report.edits import Edit
-from derender.report.mesh import Mesh
 from derender.report.opening import ImageOpener, OpenedImage, image_files, readable
 from derender.report.options import STILL_SUFFIXES
 from derender.report.panel import ROWS_PER_SHEET, SHEET, row_sheets
@@ -34,13 +31,18 @@ from derender.storage.places import counted
 from derender.training.held_out_errors import OUTLIER_PERCENTILE, fitting_better, unlike
 from derender.training.process import locked
 
+if TYPE_CHECKING:  # their imports take long
+    from derender.report.decomposition import Decomposition
+    from derender.report.edits import Edit
+    from derender.report.mesh import Mesh
+
 FILM = "film.mp4"
 ROWS = ".sheet"
 """Folder of the rows of a sheet, a file for each image, until the sheet is drawn."""
 NAMED = 5
 """So many images that cannot be read are named."""
 
-Edited = Decomposition | Edit | Mesh
+Edited: TypeAlias = "Decomposition | Edit | Mesh"
 """What can be written for one image: ``write`` its files, and a ``row`` of the sheet over all images."""
 
 

@@ -9,7 +9,6 @@ from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
-from io import BytesIO
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from PIL import Image
 
 from derender import __version__
 from derender.evaluation.score_table import Interval, ScoreTable
+from derender.report.colours import png_bytes
 from derender.storage.atomic import write_whole
 
 LONGEST_WORD = 24  # characters of a cell that is kept on one line
@@ -56,18 +56,6 @@ class Page:
     def write(self, path: str | Path) -> Path:
         """Write the document to ``path``; whole or not at all."""
         return write_whole(path, self.html().encode("utf-8", errors="replace"))
-
-
-def image_bytes(image: Image.Image, form: str = "PNG", **how: Any) -> bytes:
-    """The file of an image; ``how`` are Pillow's words for that form."""
-    stream = BytesIO()
-    image.save(stream, format=form, **how)
-    return stream.getvalue()
-
-
-def png_bytes(image: Image.Image) -> bytes:
-    """A compact PNG file."""
-    return image_bytes(image, optimize=True)
 
 
 def data_uri(source: Image.Image | bytes) -> str:

@@ -25,8 +25,8 @@ from derender.evaluation.segmentation import SegmentationComparison
 from derender.features.neighbours import Found
 from derender.report import colours
 from derender.report.charts import SERIES, bars, side_by_side
-from derender.report.colours import Images
-from derender.report.page import DIRECTIONS, Page, png_bytes
+from derender.report.colours import Images, png_bytes
+from derender.report.page import DIRECTIONS, Page
 from derender.report.panel import PAPER, GridLayout, contact_sheet, labelled_grid
 from derender.storage.atomic import write_whole
 

@@ -18,9 +18,10 @@ from derender.data.source import evenly_spaced
 from derender.model import Derenderer
 from derender.overrides import settings_by_name
 from derender.report import charts, colours
+from derender.report.colours import image_bytes
 from derender.report.decomposition import decompose_images
 from derender.report.evidence import Evidence, recorded_environment
-from derender.report.page import Page, image_bytes
+from derender.report.page import Page
 from derender.report.panel import labelled_grid
 from derender.training.config import TrainConfig
 from derender.training.run_folder import RunFolder, read_metrics

@@ -22,8 +22,7 @@ from derender.features import named
 from derender.photo.edit import AMBIENT_SHARE
 from derender.photo.video import write_video
 from derender.render import Rendering
-from derender.report.colours import Images, on_background, pictures
-from derender.report.page import image_bytes
+from derender.report.colours import Images, image_bytes, on_background, pictures
 from derender.report.panel import strip
 from derender.scene import Scene
 

@@ -27,8 +27,8 @@ from PIL import Image, ImageOps
 from derender.data import ListedStream, open_images, parse_source
 from derender.features import FeatureTable
 from derender.photo import Frame
-from derender.report.colours import pictures
-from derender.report.page import data_uri, image_bytes
+from derender.report.colours import image_bytes, pictures
+from derender.report.page import data_uri
 from derender.report.viewer.questions import Refused, pixels_of
 from derender.scene import Scene
 

@@ -31,9 +31,9 @@ from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
 from derender.postprocess.fitting import STEPS
 from derender.report import colours
+from derender.report.colours import image_bytes
 from derender.report.decomposition import factor_images
 from derender.report.mesh import model_mesh
-from derender.report.page import image_bytes
 from derender.report.panel import labelled_grid
 from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
 from derender.report.viewer.images import Example, Gallery, Shelf, ShownImage, data_url
