@@ -95,6 +95,8 @@ def test_scenes_are_optimised_before_they_are_edited(photo, model):
 
 def test_the_scene_of_a_photograph_is_that_of_its_edits(photo, model):
     pixels = np.asarray(photo)
+    with pytest.raises(ValueError, match="at least one image"):
+        derender.decompose([], model)
     scene = derender.decompose([photo, pixels[None]], model)
     assert len(scene) == 2 and scene.depth.shape[-1] == model.image_size
     alone = open_photograph(pixels, model, fit_steps=0).scene

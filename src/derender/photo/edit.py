@@ -170,11 +170,14 @@ def decompose(
 ) -> Scene:  # fmt: skip
     """Geometry, albedo, light and camera of photographs of any size: one scene for each.
 
-    Arguments are as in `relight`; ``fit_steps`` optimise the scenes. The maps have the model's size.
+    Arguments are as in `relight`; ``fit_steps`` optimise the scenes. The maps have the model's size. No
+    image is a ValueError.
     """
     loaded = as_model(model)
     given = image if isinstance(image, (list, tuple)) else [image]
     parts = [_cut_out(photo, loaded, frame)[1] for one in given for photo in as_photos(one)]
+    if not parts:
+        raise ValueError("decompose needs at least one image, got none")
     return editable_scenes(loaded, torch.cat(parts), fit_steps)
 
 
