@@ -33,12 +33,12 @@ class BrightnessPrior(Settings):
     @classmethod
     def of(cls, cues: Float[Tensor, "n 4"]) -> "BrightnessPrior":
         """Least squares over the ``brightness_cues`` of a set of images; the mean luminance stays."""
+        cues = cues.double()  # in float32 the last digits depend on where the numbers lie in memory
         luminance, light, chroma = cues[:, 0], cues[:, 1], cues[:, 2:]
         product, centre = luminance + light, chroma.mean(dim=0)
         weights = torch.linalg.lstsq(chroma - centre, (product - product.mean())[:, None]).solution[:, 0]
-        red, blue = weights.tolist()
-        offset = float(weights @ centre)
-        own, both = (float(value.mean()) - offset for value in (luminance, product))
+        means = torch.stack([luminance.mean(), product.mean()]) - weights @ centre
+        red, blue, own, both = torch.cat([weights, means]).float().tolist()
         return cls(red=red, blue=blue, albedo=own, product=both)
 
     def __call__(self, scene: Scene) -> Scene:
