@@ -61,7 +61,7 @@ class Table:
 
     def at_most(self, limit: int | None) -> "Table":
         """The same table with at most so many rows, evenly spaced."""
-        return self.select(evenly_spaced(len(self.files), limit))
+        return self if limit is None else self.select(evenly_spaced(len(self.files), limit))
 
 
 @dataclass(frozen=True)
