@@ -346,6 +346,7 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     "turns": ("yaw.json", turns),
     "bench": ("bench.json", speed.shares),
     "training-step": ("training_step.json", speed.training_step),
+    "step-profile": ("step_profile.json", speed.step_profile),
     "gpu-steps": ("gpu.json", speed.gpu_steps),
     "fitting": ("fitting.json", speed.fitting),
     "disentangle-speed": ("disentangle.json", speed.before),

@@ -12,6 +12,14 @@ def training_step(result: Any) -> Iterator[list[str]]:
         yield [row["name"], rate, f"{low:.2f} to {high:.2f}", ratio, f"{row['gflop_per_image']:.1f}"]
 
 
+def step_profile(result: Any) -> Iterator[list[str]]:
+    runs = result["rows"]
+    yield ["share of a step's processor time", *(f"`{run['preset']}`, {run['size']} px" for run in runs)]
+    for part in sorted(runs[0]["shares"], key=runs[0]["shares"].__getitem__, reverse=True):
+        yield [part, *(f"{run['shares'][part]:.1%}" for run in runs)]
+    yield ["GFLOP a processor second", *(f"{run['gflop_per_cpu_s']:.0f}" for run in runs)]
+
+
 def rasterize(result: Any) -> Iterator[list[str]]:
     yield ["64 depth maps of 64 x 64, ms an image", "plain torch", "Numba", "ratio"]
     for row in result["rows"]:
