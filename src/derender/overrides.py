@@ -36,9 +36,7 @@ def with_changes(config: Config, overrides: Iterable[str] = (), **explicit: Any)
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not key:
-            raise ValueError(
-                f"cannot read {override!r}: write key=value, for example {next(iter(names))}=..."
-            )
+            raise ValueError(f"cannot read {override!r}: write key=value, such as {next(iter(names))}=...")
         changes.append((key.strip(), _read_value(text)))
     changes += [(key.replace("__", "."), value) for key, value in explicit.items() if value is not None]
     for key, value in changes:
@@ -57,6 +55,8 @@ def checked(tree: Mapping[str, Any], kind: type[Config]) -> Config:
     except ValidationError as error:
         first = error.errors()[0]
         key, why = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        if not key:  # several settings do not fit together
+            raise ValueError(why) from error
         if first["type"] == "extra_forbidden":
             known = settings_by_name(kind().model_dump(mode="json"))
             raise ValueError(f"unknown setting {key!r}{suggestion(key, known)}") from error

@@ -144,9 +144,7 @@ def require_agreement(what: str, pairs: Iterable[tuple[Any, Any]]) -> None:
     for ours, theirs in pairs:
         apart = float((ours - theirs).abs().max()) / max(float(theirs.abs().max()), 1e-12)
         if not apart <= 1e-4:
-            raise ValueError(
-                f"the two {what} differ by {apart:.1e} of the largest value: nothing was measured"
-            )
+            raise ValueError(f"the two {what} differ by {apart:.1e} of the largest: nothing was measured")
 
 
 def _training() -> tuple[Any, Callable[[Any], None]]:

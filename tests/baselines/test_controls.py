@@ -80,9 +80,8 @@ def test_bad_input_and_a_missing_package_are_named():
 
 def test_gradientfaces_are_the_same_in_brighter_light():
     shapes = np.add.outer(np.sin(np.arange(32) / 3), np.cos(np.arange(32) / 5))
-    table = controls.descriptor_features(
-        "gradientfaces", stripes(*(100 + gain * shapes for gain in (25, 50, -50)))
-    )
+    lit = stripes(*(100 + gain * shapes for gain in (25, 50, -50)))
+    table = controls.descriptor_features("gradientfaces", lit)
     one, brighter, inverted = table.factors["gradientfaces"]
     assert one.shape == (2 * 32 * 32,) and one @ brighter > 0.97 * 32 * 32
     assert one @ inverted < -0.97 * 32 * 32

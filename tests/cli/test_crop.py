@@ -75,10 +75,8 @@ def test_what_does_not_suit_the_model_is_drawn_only_with_force(photos, tmp_path,
 
 
 def test_noise_is_left_out_though_its_grey_is_near_to_any(tmp_path, numbers, refused):
-    noise, out = (
-        np.random.default_rng(0).integers(0, 256, (300, 300, 3), dtype=np.uint8),
-        tmp_path / "lit.jpg",
-    )
+    noise = np.random.default_rng(0).integers(0, 256, (300, 300, 3), dtype=np.uint8)
+    out = tmp_path / "lit.jpg"
     Image.fromarray(noise).save(tmp_path / "noise.png")
     words = ("relight", "-m", KNOWN, tmp_path / "noise.png", "-o", out)
     line = refused(*words)

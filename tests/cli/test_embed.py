@@ -89,7 +89,7 @@ def test_what_cannot_be_read_is_one_line(tiny, tmp_path, refused, monkeypatch):
     for data, words in (
         ("someone/faces", "someone/faces does not exist here; nor does its folder"),
         ("shards-{000..002}.tar", "3 of the 3 shards of shards-{000..002}.tar do not exist"),
-        ("shards-{2..0}.tar", "should count up"),
+        ("shards-{2..0}.tar", "must count up"),
     ):
         assert words in refused("embed", "--model", tiny, "--data", data, "--out", tmp_path / "f.parquet")
     assert list(tmp_path.iterdir()) == []

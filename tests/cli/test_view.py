@@ -11,6 +11,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -87,7 +88,9 @@ def test_what_is_refused(tiny, photos, refused, tmp_path):
 def viewing(told: Path, *words: object) -> Iterator[str]:
     """The address of a viewer in a process of its own, which at the end is stopped by Ctrl-C and says so."""
     command = [sys.executable, "-m", "derender", "view", *map(str, words), "--json", str(told)]
-    with subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # where tests run in the background, too
+    with subprocess.Popen(command, text=True, preexec_fn=heard, **pipes) as process:
         try:
             yield _url(process, told)
             process.send_signal(signal.SIGINT)

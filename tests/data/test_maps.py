@@ -254,12 +254,7 @@ MISFITS = [
     ("pairs", DEPTH, b"nothing", r"depth/000_depth\.png in .* cannot be read"),
     ("pairs", DEPTH, picture(0, SIZE), r"000_depth\.png .* is RGB \(12, 12, 3\); a depth map is a grey PNG"),
     ("pairs", DEPTH, png(ZERO[:6, :6] + 9), r"is \(12, 12\), its map .*000_depth\.png \(6, 6\): both must"),
-    (
-        "masked",
-        "",
-        png(ZERO + 19),
-        r"masks/1\.png .* the number 19; classes are 0 \(background\) to 18 \(clot",
-    ),
+    ("masked", "", png(ZERO + 19), r"masks/1\.png .* number 19; classes are 0 \(background\) to 18 \(clot"),
     ("masked", "", png(ZERO.astype(np.uint16) + 300), "holds the number 300; classes are 0"),
     ("masked", "", png(np.tile(ZERO, (1, 2))), r"is 64 x 32 and its image images/1\.jpg 32 x 32: .* aspect"),
     ("masked", "", picture(0), "has 3 channels; a mask has one, of class numbers"),

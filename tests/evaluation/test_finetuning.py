@@ -65,9 +65,8 @@ def test_both_objectives_reach_the_encoders(pictures, tmp_path):
         losses = compute_step(module, images, stream, precision, 0.5, torch.from_numpy(rows))
         assert set(losses.terms) - {"target"} <= set(finetuning.RENDERING_TERMS)
         losses.total.backward()
-        results = [
-            model.model.nets[one].encoder.convolutions[0].weight.grad for one in ("geometry", "albedo")
-        ]
+        nets = (model.model.nets[one] for one in ("geometry", "albedo"))
+        results = [net.encoder.convolutions[0].weight.grad for net in nets]
         return losses.total.item(), torch.stack(results)
 
     target, rendering = gradient(1.0, 0.0), gradient(1e-12, 1.0)

@@ -52,7 +52,7 @@ def test_best_ignores_what_is_no_number_and_rows_must_fit_the_columns():
     assert scores.best(0) == 0.3
     assert table(0.2, {"a": None}).best(0) is None
     assert ScoreTable("", "", [Column("size")], [Row("a", [1]), Row("b", [2])]).best(0) is None
-    with pytest.raises(ValueError, match="'ours' has 2 cells for 1 columns"):
+    with pytest.raises(ValueError, match="'ours': 2 cells for 1 columns"):
         ScoreTable("", "", [Column("a")], [Row("ours", [1, 2])])
 
 
@@ -132,9 +132,8 @@ def test_lower_scores_are_better_by_the_controls_surplus():
     assert better.rival == "plane" and better.above and better.low == pytest.approx(0.1, abs=1e-6)
     assert worse.value == pytest.approx(-0.1) and not worse.above and worse.high < 0
     assert plane.control and not plane.versus
-    near = image_rows(
-        {name: {"error": ERROR + by} for name, by in (("m", 0), ("far", 3), ("near", 1))}, ONE, ONCE
-    )
+    errors = {name: {"error": ERROR + by} for name, by in (("m", 0), ("far", 3), ("near", 1))}
+    near = image_rows(errors, ONE, ONCE)
     assert near[0].versus["error"].rival == "near"  # the strongest control has the lowest error
 
 

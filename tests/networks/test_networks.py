@@ -20,9 +20,7 @@ def paper() -> Derenderer:
 
 
 def test_paper_networks_have_the_papers_parameter_counts(paper):
-    learnt = {
-        name: [one for one in net.parameters() if one.requires_grad] for name, net in paper.nets.items()
-    }
+    learnt = {name: [p for p in net.parameters() if p.requires_grad] for name, net in paper.nets.items()}
     assert {name: sum(one.numel() for one in values) for name, values in learnt.items()} == PAPER_PARAMETERS
 
 

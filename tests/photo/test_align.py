@@ -70,9 +70,8 @@ def test_every_face_lies_where_the_model_has_it(aligned):
 def test_heads_of_either_family_keep_nearly_their_training_frame():
     made = faces.generate(8, 256, seed=3, settings=FaceSettings(pictures_per_identity=1)).images
     for images in (made.transpose(0, 2, 3, 1), [np.asarray(head(number, 256)) for number in range(8)]):
-        results = [
-            frame_of(face, TEMPLATES["rendered-faces-64"]) for one in images for face in find_faces(one)
-        ]
+        template = TEMPLATES["rendered-faces-64"]
+        results = [frame_of(face, template) for one in images for face in find_faces(one)]
         assert len(results) >= 6 and abs(np.median([one.side for one in results]) / 256 - 1) < 0.08
 
 

@@ -153,9 +153,8 @@ def test_of_several_maps_each_is_read_again_as_it_was_written(codes, tmp_path, m
     both = torch.cat([codes[0], codes[1]], dim=1)
     given = {name: both if name in mirrored else codes[0] for name in maps} | {"camera": codes[0]}
     result = written(given)
-    assert result.keys() == maps.keys() and all(
-        torch.equal(again(given)[name], result[name]) for name in result
-    )
+    assert result.keys() == maps.keys()
+    assert all(torch.equal(again(given)[name], result[name]) for name in result)
     assert written.state_dict() == {}  # a model's weights are the same with it and without
 
 

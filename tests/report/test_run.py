@@ -75,9 +75,8 @@ def pictures() -> ImageSet:
 def test_everything_that_can_be_told_is_told_and_escaped(smallest, pictures, tmp_path):
     pytest.importorskip("captum")
     done = []
-    result = gather(
-        Subject(smallest.eval(), pictures, pictures, "All of them"), lambda *step: done.append(step)
-    )
+    subject = Subject(smallest.eval(), pictures, pictures, "All of them")
+    result = gather(subject, lambda *step: done.append(step))
     assert list(result.sections) == ["data", "decomposed", "films", "scores", "card", "explained"]
     assert result.failed == [] and done == [(step, 6) for step in range(7)]
     html = run_page(start_run(tmp_path / "run", resolve("small"), {}, "cpu").path, result).html()

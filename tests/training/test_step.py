@@ -127,9 +127,8 @@ def test_a_shared_template_leaves_cameras_and_lights_their_own(model, images, ge
 
 def test_the_step_follows_the_run_and_validation_does_not(model, images, generator):
     task = DerenderTask(TrainConfig(objective=TEMPLATE))
-    module = Step(
-        model, task.losses(model, RunFolder(Path()), torch.zeros(0, 3, 32, 32, dtype=torch.uint8), print)
-    )
+    none = torch.zeros(0, 3, 32, 32, dtype=torch.uint8)
+    module = Step(model, task.losses(model, RunFolder(Path()), none, print))
 
     def depth(done):
         return compute_step(module, images, generator, nullcontext, done).scene.depth

@@ -14,9 +14,7 @@ def align(
     output: Output,
     model: str | None = option(None, MODEL, "--model", "-m", metavar="MODEL"),
     size: int = option(256, "Side of the crops in pixels.", min=8, max=4096),
-    margin: float = option(
-        0.0, "More of the surroundings on every side, in shares of the side.", min=0, max=2
-    ),
+    margin: float = option(0.0, "More surroundings on every side, in shares of the side.", min=0, max=2),
     largest: bool = option(False, "Only the largest face of each photograph.", "--largest"),
     keep: bool = option(False, "Of photographs without a face, keep the middle square.", "--keep"),
 ) -> None:

@@ -37,9 +37,7 @@ MODEL = f"Instead of --features, with IMAGES. {options.MODELS}"
 class Labels:
     """The labels of a score, and the rows that carry them."""
 
-    label: list[str] | None = option(
-        None, "Label column; repeated: mean over yes/no labels.", "--label", "-l"
-    )
+    label: list[str] | None = option(None, "Label column; repeated: mean of yes/no labels.", "--label", "-l")
     attributes: bool = option(False, "Score by every yes/no label.", "--attributes")
     min_count: int = number(1, "Leave out classes of fewer rows.")
     max_count: int | None = number(None, "Use at most N rows of a class.")

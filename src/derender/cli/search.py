@@ -40,9 +40,7 @@ def search(
     ]
     shown = [name for name in match.table.labels if name != "partition"][:LABELS_SHOWN]
     columns = (Column("distance", digits=4), *map(Column, shown))
-    rows = [
-        Row(one["file"], (one["distance"], *(str(one["labels"][name]) for name in shown))) for one in near
-    ]
+    rows = [Row(one["file"], (one["distance"], *(str(one["labels"][key]) for key in shown))) for one in near]
     caption = f"nearest to {like} by {factor}, {metric} distance, in {features} ({len(match.table):,} rows)"
     show_scores(ScoreTable(caption, "file", columns, rows), output.json_file)
     if match.unchecked:

@@ -21,13 +21,9 @@ class Chosen:
     model: str | None = option(None, MODEL, metavar="NAME")
     preset: str | None = option(None, PRESET)
     start_from: str | None = option(None, START_FROM, metavar="MODEL")
-    loocc: str | None = option(
-        None, "Contrast over none, light, light+camera or all factors; names joined by +."
-    )
+    loocc: str | None = option(None, "Contrast over none, light, light+camera or all; names joined by +.")
     renderer: str | None = option(None, RENDERER, metavar="NAME")
-    config: str | None = option(
-        None, "Settings in YAML, such as a run's; options come after.", metavar="FILE"
-    )
+    config: str | None = option(None, "Settings in YAML, as a run's; options come after.", metavar="FILE")
     resume: Resume = False
     device: Device = "auto"
 

@@ -8,7 +8,6 @@ always a path.
 
 import hashlib
 import os
-import re
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
@@ -22,12 +21,11 @@ from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_path
 from derender.data.source import FileSource, FolderSource, Source, ZipSource, is_hidden, is_image
 from derender.data.stream import Sample, Stream
 from derender.data.streamed import SHARD_SUFFIXES, HuggingFaceStream, ShardStream, find_shards, is_saved
-from derender.storage.places import SUFFIXES, nearest_sibling, require_known
+from derender.storage.places import SUFFIXES, hub_id, nearest_sibling, require_known
 
 STREAMED = ("webdataset", "huggingface")
 """The layouts that are read from front to back, by the names one can ask for them."""
 
-_IDENTIFIER = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _OPTIONS = ("column", "config", "revision", "half")
 _ENTRIES_LOOKED_AT = 10_000
 
@@ -84,7 +82,7 @@ def open_images(
         stream = ShardStream(str(source), find_shards(path, str(source), part), options.get("column"))
     elif path.exists():
         stream = HuggingFaceStream(str(source), path, split=part, **options)
-    elif _IDENTIFIER.fullmatch(place):
+    elif hub_id(place):
         try:
             stream = HuggingFaceStream(str(source), place, split=part, **options)
         except ValueError as problem:
@@ -193,7 +191,7 @@ def _kind_of(path: Path, written: str) -> str | None:
     if path.exists():
         return "huggingface" if name.endswith(".parquet") and not holds_paths(path) else None
     a_file = name.endswith((".zip", *TABLE_SUFFIXES, *SHARD_SUFFIXES, *SUFFIXES))
-    return "huggingface" if _IDENTIFIER.fullmatch(written) and not a_file else None
+    return "huggingface" if hub_id(written) and not a_file else None
 
 
 def _kind_of_folder(folder: Path) -> str | None:

@@ -173,9 +173,7 @@ def expand_braces(pattern: str) -> Iterator[str]:
         elif numbers is not None:
             first, last = int(numbers[1]), int(numbers[2])
             if last < first or last - first >= _MOST_SHARDS:
-                raise ValueError(
-                    f"{{{piece}}} in {pattern} should count up, to at most {_MOST_SHARDS:,} names"
-                )
+                raise ValueError(f"{{{piece}}} in {pattern} must count up, to at most {_MOST_SHARDS:,} names")
             width = len(numbers[1]) if numbers[1].startswith("0") else 0
             choices.append([f"{number:0{width}d}" for number in range(first, last + 1)])
         elif "," in piece:

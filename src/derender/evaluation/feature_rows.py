@@ -213,9 +213,7 @@ def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndar
     rows = [row for own in places.values() if len(own) >= count for row in own[:most]]
     if not rows:
         largest = max(map(len, places.values()), default=0)
-        raise ValueError(
-            f"no class has {count} members or more (the largest has {largest}): bring more of each"
-        )
+        raise ValueError(f"no class has {count} members or more (the largest has {largest}): bring more")
     return np.sort(np.array(rows))
 
 

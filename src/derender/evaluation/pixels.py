@@ -65,9 +65,7 @@ class ReconstructionResult(ImageResult):
         "model": "model", "mean_picture": "mean image", "components": "PCA ({0.n_components})",
         "untrained": "untrained model",
     }  # fmt: skip
-    notes: ClassVar[Mapping[str, str]] = {
-        "untrained model": "same networks, fresh weights, inside its own mask"
-    }
+    notes: ClassVar[Mapping[str, str]] = {"untrained model": "same networks, fresh weights, in its own mask"}
 
     model: ReconstructionScores
     mean_picture: ReconstructionScores

@@ -82,9 +82,7 @@ class ScoreTable:
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row.cells) != len(self.columns):
-                raise ValueError(
-                    f"row {row.name!r} has {len(row.cells)} cells for {len(self.columns)} columns"
-                )
+                raise ValueError(f"row {row.name!r}: {len(row.cells)} cells for {len(self.columns)} columns")
 
     def numbers(self, column: int) -> list[float]:
         """Every finite number of one column."""

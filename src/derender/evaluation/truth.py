@@ -104,7 +104,7 @@ def geometry_scores(
     if not inside.any():
         raise ValueError("the true masks are empty after taking one pixel off: nothing to compare")
     if not valid.any():
-        raise ValueError("prediction and truth share no pixel in any image: check the camera or the masks")
+        raise ValueError("prediction and truth share no pixel in any image: check camera and masks")
     for name, depth in (("predicted", depth_pred), ("true", depth_true)):
         if not bool((torch.isfinite(depth[valid]) & (depth[valid] > 0)).all()):
             raise ValueError(f"{name} depth must be positive and finite inside its mask")
@@ -317,9 +317,7 @@ def evaluate_factors(
         parts = map_batches(partial(see, net), net, truth.images, batch_size=batch_size)
         albedo, mask, light, camera = map(torch.cat, zip(*parts, strict=True))
         if not bool((both := mask & true_mask).any()):
-            raise ValueError(
-                "prediction and truth share no pixel in any image: check the camera or the masks"
-            )
+            raise ValueError("prediction and truth share no pixel in any image: check camera and masks")
         lights = (light_error(light, camera, *exact, aligned=one).each_deg for one in (False, True))
         return scored(albedo, both, *lights, camera_error(camera, exact[1]).each_deg)
 

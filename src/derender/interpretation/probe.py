@@ -55,9 +55,7 @@ def question(
         ValueError: no labels, an unknown name, one class, fewer than 20 labelled images.
     """
     if not labels:
-        raise ValueError(
-            f"{source} has no labels, and an explanation needs an answer to explain: add a table"
-        )
+        raise ValueError(f"{source} has no labels, and an explanation needs answers to explain: add a table")
     columns, known = {}, {}
     for name in names:
         values = np.asarray(named(labels, name, f"label of {source}"))

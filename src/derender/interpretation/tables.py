@@ -273,9 +273,7 @@ def unchanged(rows: Sequence[Similarity], changed: str) -> list[str]:
 def cluster_share_table(result: ClusterShares) -> ScoreTable:
     """Parts of the distance of each cluster from the rest, and between-variance beside chance."""
     share = "share of the squared distance to the mean of all other images, 0 to 1"
-    ratio = Column(
-        "ratio", note="share of this factor's variance between cluster and rest; in brackets chance"
-    )
+    ratio = Column("ratio", note="share of a factor's variance between cluster and rest; in brackets chance")
     columns = [column for factor in result.factors for column in (Column(factor, note=share), ratio)]
     rows = []
     columns_of = (result.names, result.sizes, result.share, result.ratio, result.chance)
@@ -297,9 +295,7 @@ def pair_table(result: PairParts, names: tuple[str, str]) -> ScoreTable:
         Column("alike", note="share of random pairs that lie farther apart in this factor; 1 is most alike"),
     )
     parts = zip(result.distance_share, result.cosine, result.own_cosine, result.quantile, strict=True)
-    rows = [
-        Row(factor, tuple(map(float, cells))) for factor, cells in zip(result.factors, parts, strict=True)
-    ]
+    rows = [Row(factor, tuple(map(float, own))) for factor, own in zip(result.factors, parts, strict=True)]
     whole = Row("all", (float(result.distance_share.sum()), float(result.cosine.sum()), None, None))
     caption = f"{names[0]} and {names[1]}: most alike in {result.most_alike}, compared with other pairs"
     return ScoreTable(caption, "factor", columns, (*rows, whole))

@@ -217,9 +217,7 @@ def two_views(
     n, _, height, width = images.shape
     crop = min(crop, 3 * min(height, width) // 4) // stride * stride
     if crop < 2 * stride:
-        raise ValueError(
-            f"images of {height} x {width} are too small to learn features of stride {stride} from"
-        )
+        raise ValueError(f"images of {height} x {width} are too small for features of stride {stride}")
     cells = crop // stride
     reach = torch.tensor(max(1, cells // 4))
     corners = []

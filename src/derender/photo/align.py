@@ -109,9 +109,7 @@ def align(
     loaded = None if model is None else as_model(model)
     template = UTKFACE if loaded is None else template_of(loaded)
     if template is None:
-        raise ValueError(
-            f"{model} is not known to be of faces: choose faces-64 or rendered-faces-64, or none"
-        )
+        raise ValueError(f"{model} is not known to be of faces: choose faces-64, rendered-faces-64 or none")
     held_out = read_errors(loaded.source) if loaded is not None and loaded.source is not None else None
     cutter = _Cutter(Path(out), size, margin, largest, keep, template, loaded, held_out)
     boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"

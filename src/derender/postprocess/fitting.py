@@ -119,16 +119,15 @@ def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor,
     rows, columns = centred.shape
     count = min(count, rows, columns)
     wide = columns > rows
-    gram = (centred @ centred.T if wide else centred.T @ centred).double().cpu().numpy()
+    exact = centred.double()  # float32 sums depend on where memory begins
+    gram = (exact @ exact.T if wide else exact.T @ exact).cpu().numpy()
     result = eigh(gram, subset_by_index=[len(gram) - count, len(gram) - 1])
-    variances, vectors = (torch.from_numpy(part.copy()).flip(-1) for part in result)
-    directions = vectors.T.to(centred)
-    if wide:
-        directions = directions @ centred
+    variances, vectors = (torch.from_numpy(part.copy()).flip(-1).to(exact) for part in result)
+    directions = vectors.T @ exact if wide else vectors.T
     length = directions.norm(dim=1, keepdim=True)
-    distinct = (variances > variances.max() * 1e-10).to(centred)[:, None]
-    directions = directions / length.clamp(min=torch.finfo(centred.dtype).tiny) * distinct
-    return (variances.clamp(min=0) / rows).sqrt().to(centred), directions
+    distinct = (variances > variances.max() * 1e-10)[:, None]
+    directions = directions / length.clamp(min=torch.finfo(exact.dtype).tiny) * distinct
+    return (variances.clamp(min=0) / rows).sqrt().to(centred), directions.to(centred)
 
 
 @dataclass(frozen=True)

@@ -109,9 +109,7 @@ def _svg(figure: Figure) -> str:
     text = re.sub(r"font-family: [^;\"]*;?", "", text)
     prefix = "c" + sha256(text.encode()).hexdigest()[:8]  # ids of one chart must not meet those of another
     used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', text))
-    text = re.sub(
-        r' id="([^"]+)"', lambda match: f' id="{prefix}-{match[1]}"' if match[1] in used else "", text
-    )
+    text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", text)
     return text.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')
 
 

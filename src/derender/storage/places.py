@@ -105,7 +105,7 @@ def downloaded(repository: str, names: Sequence[str]) -> Path:
 
 def hub_id(name: str) -> bool:
     """Whether a name reads OWNER/NAME."""
-    return bool(re.fullmatch(r"[\w-][\w.-]*/[\w.-]+", name))
+    return bool(re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name))
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

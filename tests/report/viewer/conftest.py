@@ -75,9 +75,8 @@ class Client:
                 connection.putheader(name, value)
         connection.endheaders(content)
         answer = connection.getresponse()
-        reply = Reply(
-            answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
-        )
+        headers = {name.lower(): value for name, value in answer.getheaders()}
+        reply = Reply(answer.status, headers, answer.read())
         connection.close()
         return reply
 

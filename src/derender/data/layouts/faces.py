@@ -104,9 +104,7 @@ def load_lfw(source: Source) -> Table | None:
 
 def raf_list(source: Source) -> str | None:
     """The list of the basic set, shallowest first, or None."""
-    results = [
-        file for file in source.files if file.endswith(_RAF_LISTS) and "compound" not in file.split("/")
-    ]
+    results = [one for one in source.files if one.endswith(_RAF_LISTS) and "compound" not in one.split("/")]
     return min(results, key=lambda file: (file.count("/"), file), default=None)
 
 

@@ -85,9 +85,7 @@ def open_viewer(
     gallery = None
     if table is not None:
         if not set(table.factors) & set(model.nets):
-            raise ValueError(
-                f"the table has none of the factors of {source}: make it again with derender embed"
-            )
+            raise ValueError(f"the table has none of the factors of {source}: make it anew by derender embed")
         gallery = Gallery(table, data, dataset)
     read, problems = readable(images, read_photo)
     notes = [f"left out {path}: {reason}" for path, reason in problems.items()]

@@ -145,9 +145,7 @@ def read_request(kind: type[Question], body: bytes) -> Question:
 
 
 def too_large() -> Refused:
-    return Refused(
-        413, f"this file is larger than {BODY_LIMIT_BYTES // 10**6} MB: make the image smaller first"
-    )
+    return Refused(413, f"this file is larger than {BODY_LIMIT_BYTES // 10**6} MB: make it smaller first")
 
 
 def pixels_of(
