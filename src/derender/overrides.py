@@ -55,8 +55,6 @@ def checked(tree: Mapping[str, Any], kind: type[Config]) -> Config:
     except ValidationError as error:
         first = error.errors()[0]
         key, why = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        if not key:  # several settings do not fit together
-            raise ValueError(why) from error
         if first["type"] == "extra_forbidden":
             known = settings_by_name(kind().model_dump(mode="json"))
             raise ValueError(f"unknown setting {key!r}{suggestion(key, known)}") from error

@@ -90,7 +90,10 @@ FAULTS = {
     "into the next": (set_in_directory(PLAIN, NAME, 20, b"\xff\xff"), REFUSED + "reaches into"),
     "another checksum": (set_in_directory(PLAIN, NAME, 16, b"\0\0"), REFUSED + "Bad CRC-32"),
     "more than it says": (set_in_directory(PLAIN, NAME, 24, b"\1\0"), REFUSED + "Bad CRC-32"),
-    "less than it says": (set_in_directory(PLAIN, NAME, 24, b"\0\xff"), REFUSED + "(shorter|Bad CRC-32)"),
+    "less than it says": (
+        set_in_directory(PLAIN, NAME, 24, b"\0\xff"),
+        REFUSED + "(shorter than|Bad CRC-32)",
+    ),
 }
 
 

@@ -2,22 +2,17 @@
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
 import derender
-from derender.data import ImageSet
 from derender.data.synthetic import faces
 from derender.data.synthetic.settings import EffectSettings, FaceSettings
-from derender.learn import run_settings
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
 from derender.scene.crop import CropSettings, crop_images
 from derender.training import distillation
-from derender.training.checkpoint import WEIGHTS_FILE
 from derender.training.config import FeatureSettings
 from derender.training.features import make_features
-from derender.training.run_folder import read_metrics
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25)
 LESSONS = distillation.RefiningSettings(
@@ -137,30 +132,6 @@ def test_a_copy_distilled_so_steps_back_from_smaller_faces(model, images):
     near, far = (learned.decompose(one).camera[:, 5] for one in (pictures, smaller))
     assert (far > near).float().mean() > 0.9
     assert float(far.mean() - near.mean()) > 0.02, "the part of 0.7 that few examples show"
-
-
-def test_a_run_refines_its_model_once_training_has_ended(tmp_path):
-    made = faces.generate(16, image_size=32, seed=9).images
-    pictures = ImageSet(made, tuple(f"{number}.png" for number in range(16)), source="made")
-    brief = "image_size=32 width=8 light_width=4 images=8 batch_size=8 split=[0.5,0.5,0] perceptual=none"
-    lessons = "refining.images=32 fit_steps=2 refining.reframed=0.5 examples=8 coordinates=4 pictures=8"
-    how = {"preset": "small", "settings": [*brief.split(), *lessons.split()], "page": False}
-    derender.train(pictures, out=tmp_path / "run", **how)
-    model = derender.load(tmp_path / "run")
-    assert model.whitening and model.fitting and model.settings.ranges.translation_z > 0
-    trained, own = load_file(tmp_path / "run" / "checkpoints" / "last" / WEIGHTS_FILE), model.state_dict()
-    same = {name.split(".")[1] for name in own if torch.equal(own[name], trained[name])}
-    assert same == {"confidence"}, "of which scenes know nothing"
-    assert any("refined: error" in row.get("text", "") for row in read_metrics(tmp_path / "run"))
-    derender.train(pictures, out=tmp_path / "run", resume=True, page=False)
-    again = derender.load(tmp_path / "run").state_dict()
-    assert all(torch.equal(value, again[name]) for name, value in own.items())
-
-
-@pytest.mark.parametrize("change", [{"maps_only": True}, {"fitting.examples": 0}, {"split": [0.8, 0, 0.2]}])
-def test_runs_that_cannot_be_refined_are_refused_before_they_begin(change):
-    with pytest.raises(ValueError, match=r"setting 'refining.images': needs fitting.examples of 2 .* got 8"):
-        run_settings(settings={"refining.images": 8, **change})
 
 
 @pytest.mark.parametrize("renderer", ["phong+haze", "sh"])

@@ -79,7 +79,9 @@ def killed_at(step: int, work) -> bool:
 
 
 @pytest.mark.parametrize("exchange", [True, False])
-def test_a_kill_at_any_step_of_writing_a_checkpoint_leaves_one(net, run, tmp_path, monkeypatch, exchange):
+def test_a_kill_at_any_step_of_writing_a_checkpoint_leaves_a_whole_one(
+    net, run, tmp_path, monkeypatch, exchange
+):
     if not exchange:
         monkeypatch.setattr(atomic, "_exchanged", lambda one, other: False)
     seen, step = set(), 0

@@ -21,7 +21,6 @@ PHASES = {
     "reading": ("reading", "images"),
     "train": ("training", "images"),
     "perceptual": ("perceptual features", "steps"),
-    "refining": ("refining", "images"),
     "features": ("whitening features", "images"),
     "scoring": ("scoring", "heads"),
 }

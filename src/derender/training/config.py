@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from derender.data import suggestion
 from derender.model import load
 from derender.networks import Factor
 from derender.networks.factors import GEOMETRY_START
 from derender.overrides import SHORT, settings_by_name, with_changes
-from derender.postprocess.fitting import STEPS, FittingSettings
+from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
 from derender.scene.crop import DEFAULT_CROPS, CropSettings
@@ -91,20 +91,6 @@ class FeatureSettings(Settings):
     brightness: bool = True  # estimate the prior that shares brightness between albedo and light
 
 
-class Refinement(Settings):
-    """How a trained model learns scenes that were optimised (training/distillation.py)."""
-
-    images: int = Field(default=0, ge=0)  # seen, repeats counted; 0: it does not
-    fitted: int = Field(default=12_000, ge=2)  # at most so many images are fitted
-    fit_steps: int = Field(default=STEPS, ge=1, le=10_000)  # steps by which each scene is optimised
-    worst: float = Field(default=0.03, ge=0, lt=1)  # share of them, fitted worst, that is left out
-    rendered: float = Field(default=0.5, ge=0, le=1)  # share of a batch that are renderings
-    exchanged: float = Field(default=0.5, ge=0, le=1)  # share of those with another's geometry
-    picture_weight: float = Field(default=1.0, ge=0)  # of the reconstruction error
-    reframed: float = Field(default=0.0, ge=0, le=1)  # share of a batch that is shown in other crops
-    strange: float = Field(default=0.5, ge=0, le=1)  # share of those with another image beyond their edge
-
-
 class OptimiserSettings(Settings):
     """Adam with weight decay, after a linear warm-up; ``final_rate`` < 1 lets it fall along a cosine."""
 
@@ -166,7 +152,6 @@ class TrainConfig(LoopSettings):
     objective: ObjectiveSettings = ObjectiveSettings()
     whitening: WhiteningSettings = WhiteningSettings()
     fitting: FittingSettings = FittingSettings()
-    refining: Refinement = Refinement()  # after training, as by `derender refine`; crops are ``reframe``
     brightness: bool = True  # as in FeatureSettings
 
     @field_validator("model")
@@ -175,14 +160,6 @@ class TrainConfig(LoopSettings):
         if value.network.unet_decoder:
             raise ValueError("network.unet_decoder: rendering trains none, derender unet distils one")
         return value
-
-    @model_validator(mode="after")
-    def _refinable(self) -> "TrainConfig":
-        able = self.fitting.examples >= 2 and self.split[1] > 0 and not self.maps_only
-        if self.refining.images and not able:
-            needs = "needs fitting.examples of 2 or more, a validation part and no maps_only"
-            raise ValueError(f"setting 'refining.images': {needs}, got {self.refining.images}")
-        return self
 
     @property
     def features(self) -> FeatureSettings:

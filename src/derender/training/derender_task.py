@@ -19,17 +19,16 @@ from derender.objectives.self_features import load_self_features, train_self_fea
 from derender.postprocess import Features
 from derender.postprocess.whitening import Whitening
 from derender.storage.atomic import DamageNoticed
-from derender.storage.folder import SplitRecord, write_split
+from derender.storage.folder import write_config
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
 from derender.training.config import ObjectiveSettings, TrainConfig
-from derender.training.distillation import refine_after_training
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
 from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
 from derender.training.loop import MAX_VALIDATION_IMAGES, NOT_RECONSTRUCTION, train_task
 from derender.training.process import deterministic_algorithms, locked
-from derender.training.run_folder import RunFolder, append_metrics
+from derender.training.run_folder import RunFolder
 from derender.training.step import StepResult, own_share, training_step
 from derender.training.task import Losses, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
 from derender.training.watch import Watcher
@@ -56,21 +55,12 @@ def train(
             split = split_indices(images.files, config.split, seed=config.seed)
             mapped = isinstance(images.images, np.memmap)
             some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
-            held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
-            model, maps = load(folder.model, device=device), None
+            phase, trained = Progress.of("features", report), load(folder.model, device=device)
             with deterministic_algorithms(config.deterministic):
-                if config.refining.images:
-                    phase = Progress.of("refining", report)
-                    made = refine_after_training(model, some, torch.from_numpy(held_out), config, phase)
-                    model, maps = made.model, made.model.features.required_fitting().maps
-                    text = "refined: error of reconstructions {before:.4f}, now {now:.4f}"
-                    own = {"images": result.images, "seconds": round(result.seconds, 2)}
-                    append_metrics(folder, {"kind": "note", **own, "text": text.format(**made.errors)})
-                phase, seed = Progress.of("features", report), config.seed
-                model = make_features(model, some, config.features, seed=seed, progress=phase, maps=maps)
-                model.save(folder.model, overwrite=True)
-                write_split(folder.model, SplitRecord(config.split, config.seed))
-                store_errors(folder.model, held_out)
+                model = make_features(trained, some, config.features, seed=config.seed, progress=phase)
+                write_config(folder.model, [factor.name for factor in model.factors], model.settings)
+                model.features.save(folder.model)
+                store_errors(folder.model, images.images[split.validation[:MAX_VALIDATION_IMAGES]])
     return result
 
 

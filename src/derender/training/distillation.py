@@ -25,12 +25,12 @@ from derender.model import Derenderer
 from derender.networks.factors import Number
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_features import one_cycle
-from derender.postprocess.fitting import PARAMETERS, MorphableMaps
+from derender.postprocess.fitting import PARAMETERS, STEPS, MorphableMaps
 from derender.scene import Scene, crop
 from derender.scene.perturb import PerturbSettings
 from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
-from derender.training.config import FeatureSettings, Refinement, TrainConfig, WhiteningSettings
+from derender.training.config import FeatureSettings
 from derender.training.features import make_features
 from derender.training.step import fill_uncovered
 from derender.training.views import batches
@@ -63,8 +63,17 @@ class StudentSettings(Settings):
             )
 
 
-class RefiningSettings(StudentSettings, Refinement):
+class RefiningSettings(StudentSettings):
     """How encoders and decoders learn the fitted scenes."""
+
+    fitted: int = Field(default=12_000, ge=2)  # at most so many images are fitted
+    fit_steps: int = Field(default=STEPS, ge=1, le=10_000)  # steps by which each scene is optimised
+    worst: float = Field(default=0.03, ge=0, lt=1)  # share of them, fitted worst, that is left out
+    rendered: float = Field(default=0.5, ge=0, le=1)  # share of a batch that are renderings
+    exchanged: float = Field(default=0.5, ge=0, le=1)  # share of those with another's geometry
+    picture_weight: float = Field(default=1.0, ge=0)  # of the reconstruction error
+    reframed: float = Field(default=0.0, ge=0, le=1)  # share of a batch that is shown in other crops
+    strange: float = Field(default=0.5, ge=0, le=1)  # share of those with another image beyond their edge
 
 
 class RefineConfig(FeatureSettings):
@@ -126,18 +135,6 @@ def refine(
     features = config.model_copy(update={"fitting": fitting})
     student = make_features(student, images, features, seed=seed, progress=progress, maps=maps)
     return Student(student, *_compared(model, student, held_out[:MEASURED_IMAGES], settings.fit_steps))
-
-
-def refine_after_training(
-    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], held_out: UInt8[Tensor, "m 3 h w"],
-    config: TrainConfig, progress: Progress | None = None,
-) -> Student:  # fmt: skip
-    """A copy of a trained model without features, refined as its run asks; errors are those of `refine`."""
-    how: dict[str, Any] = {"whitening": WhiteningSettings(pictures=0), "fitting": config.fitting}
-    first = make_features(model, images, FeatureSettings(**how, brightness=False), seed=config.seed)
-    settings = RefiningSettings(**config.refining.model_dump())
-    asked = RefineConfig(**how, refining=settings, reframe=config.reframe, brightness=False)
-    return refine(first, images, held_out, asked, seed=config.seed, progress=progress)
 
 
 @dataclass(frozen=True)
