@@ -25,14 +25,14 @@ BUDGET = {  # lines, files
     "networks": (705, 5),
     "storage": (940, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
-    "postprocess": (965, 5),  # features of the canonical view; images framed as training images are
+    "postprocess": (980, 5),  # features of the canonical view; images framed as training images are
     "scene": (880, 11),  # crops of crops
     "demo": (485, 3),  # the light of the last portrait
     "renderers": (655, 8),
     "learn": (920, 5),
 }
 TOTAL = (38_768, 239)  # on the way to (37_000, 270)
-TEST_LINES = 25_974
+TEST_LINES = 25_987
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

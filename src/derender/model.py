@@ -117,8 +117,9 @@ class Derenderer(EmbeddingModel, Shareable):
         return Scene.from_parameters({f.parameter: f.to_parameter(raw[f.name], ranges) for f in self.factors})
 
     def decompose(self, images: GivenImages) -> Scene:
-        """The scenes of images, (N, 3, S, S) in 0..1 or what `as_batch` takes."""
-        return self.balanced(self.decode(self.encode(as_batch(images, self.image_size, self.device))))
+        """The scenes of images, (N, 3, S, S) in 0..1 or what `as_batch` takes, found in `framed` ones."""
+        framed, crops = self.framed(as_batch(images, self.image_size, self.device))
+        return self.placed(self.balanced(self.decode(self.encode(framed))), crops)
 
     def render(self, scene: Scene) -> Rendering:
         """Images of scenes, with the model's field of view."""

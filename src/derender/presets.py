@@ -1,8 +1,8 @@
 """Models by name: one row each.
 
 `paper` is the paper's model; `faces` and `cats` are the same, as unsup3d's ranges for them are. `cars` has
-ranges for cars. `small` has a quarter of the widths (a sixteenth of the work) and trains on a CPU. How each
-is trained is in training/config.py under the same names.
+ranges for cars. `small` has a quarter of the widths (a sixteenth of the work) and trains on a CPU;
+`small-faces` starts from a bundled model. How each is trained is in training/presets.yaml.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,10 +43,11 @@ class ModelSettings(Settings):
         )
 
 
+_SMALL = ModelSettings(network=NetworkSettings(width=16, light_width=8))
 MODEL_PRESETS: dict[str, ModelSettings] = {
     **dict.fromkeys(("paper", "faces", "cats"), ModelSettings()),
     "cars": ModelSettings(ranges=SceneRanges(border_depth=1.08, diffuse=(0.5, 1.0))),
-    "small": ModelSettings(network=NetworkSettings(width=16, light_width=8)),
+    **dict.fromkeys(("small", "small-faces"), _SMALL),
 }
 
 

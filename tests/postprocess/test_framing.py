@@ -6,11 +6,12 @@ from torch.nn.functional import interpolate
 
 import derender
 from derender.data.synthetic import faces
+from derender.objectives.reconstruction import masked_l1
 from derender.postprocess import Features
 from derender.postprocess.fitting import coordinates_of
 from derender.postprocess.framing import Framing
 from derender.postprocess.whitening import Whitening
-from derender.scene.crop import back, crop_images, parameters_of, similarities, within
+from derender.scene.crop import back, crop_images, crop_scene, parameters_of, similarities, within
 from derender.storage.tensors import write_tensors
 from derender.training import framing as training
 from derender.training.framing import drawn_crops, fit_framing
@@ -88,14 +89,26 @@ def test_features_follow_the_crop_less_than_without(model, heads):
         assert likeness[0] > max(0.85, likeness[1] + 0.1)
 
 
-def test_scenes_are_optimised_in_the_crop_that_is_found(model, heads):
-    fitting = model.with_features(model.features.with_steps(2))
-    images = interpolate(moved(heads[:4], MOVES[1]), (64, 64), mode="bilinear", antialias=True)
-    framed = model.whitening.framing(images)
-    assert not torch.equal(framed, images)
+def test_scenes_are_found_in_the_crop_and_their_cameras_move_back(model, heads):
+    images = interpolate(moved(heads[:8], MOVES[1]), (64, 64), mode="bilinear", antialias=True)
+    unframed = model.with_features(Features(fitting=model.fitting))
     with torch.no_grad():
-        coordinates = fitting.activations(images)[coordinates_of("geometry")]
-    assert torch.equal(coordinates, fitting.fit_scenes(framed, 2).coordinates["geometry"])
+        framed, crops = model.framed(images)
+        scenes = model.decompose(images), model.fit_scenes(images, 2).scene
+        inside = unframed.decompose(framed), unframed.fit_scenes(framed, 2).scene
+        error, before = (
+            float(masked_l1(again.image, images, again.mask))
+            for again in (model.render(scenes[0]), model.render(unframed.decompose(images)))
+        )
+        coordinates = model.with_features(model.features.with_steps(2)).activations(images)
+    assert not torch.equal(framed, images) and torch.equal(framed, model.whitening.framing(images))
+    for scene, found in zip(scenes, inside, strict=True):
+        assert torch.equal(scene.depth, found.depth) and torch.equal(scene.light, found.light)
+        torch.testing.assert_close(crop_scene(scene, crops, model.fov_deg).camera, found.camera)
+    assert error < 0.95 * before
+    fitted = unframed.fit_scenes(framed, 2).coordinates["geometry"]
+    assert torch.equal(coordinates[coordinates_of("geometry")], fitted)
+    assert torch.equal(model.canonical_view(images), model.frontal(framed))
 
 
 def test_a_network_is_kept_in_the_file_of_whitening(model, tmp_path):

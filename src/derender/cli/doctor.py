@@ -14,9 +14,7 @@ WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good":
 def doctor(
     image_set: DataOptions,
     output: Output,
-    out: Path | None = option(
-        None, "Also write a page with example images.", "--out", "-o", metavar="FILE.html"
-    ),
+    out: Path | None = option(None, "Also write a page with examples.", "--out", "-o", metavar="FILE.html"),
     seed: Seed = 0,
     check: bool = option(False, "Exit with 1 where the images do not suit the method.", "--check"),
 ) -> None:

@@ -308,14 +308,10 @@ def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:
     if batch.ndim == 4 and batch.shape[-1] != 3:
         batch = batch.transpose(0, 2, 3, 1)
     if batch.ndim != 4 or batch.shape[-1] != 3 or not batch.size:
-        raise ValueError(
-            f"an array of shape {shape} is no image: give (H, W, 3), (3, H, W), or a batch of either"
-        )
+        raise ValueError(f"an array of shape {shape} is no image: give (H, W, 3), (3, H, W) or a batch")
     if batch.dtype != np.uint8:
         if batch.dtype.kind != "f":
-            raise ValueError(
-                f"images must be bytes (uint8) or numbers in 0..1, got {images.dtype}: convert them"
-            )
+            raise ValueError(f"images must be uint8 or numbers in 0..1, got {images.dtype}: convert them")
         refuse_values(batch)
         batch = np.rint(np.clip(batch, 0, 1) * 255).astype(np.uint8)
     return [np.ascontiguousarray(image) for image in batch]

@@ -210,9 +210,7 @@ class FactorResult(ImageResult):
     columns: ClassVar[Mapping[str, Column]] = {
         "albedo": Column("albedo", "low", 4, "root mean square error after each image's best scale, best 0"),
         "albedo_global": Column("one scale", "low", 4, "the same after one scale for all images"),
-        "light": Column(
-            "light", "low", 1, "mean angle in degrees between true and predicted direction, best 0"
-        ),
+        "light": Column("light", "low", 1, "mean degrees between true and predicted direction, best 0"),
         "aligned": Column("aligned", "low", 1, "the same after the best rotation of all directions"),
         "camera": Column("camera", "low", 1, "mean angle in degrees of the remaining rotation, best 0"),
     }

@@ -95,9 +95,7 @@ def as_pixels(X: Any, image_size: int) -> np.ndarray:
         paths = array.reshape(-1).tolist()
         for item in paths:
             if not isinstance(item, (str, os.PathLike)):
-                raise ValueError(
-                    f"expected paths of images, got {type(item).__name__}: give paths or an array"
-                )
+                raise ValueError(f"expected paths of images, got {type(item).__name__}: give paths or arrays")
         return np.stack([read_image(Path(item), image_size) for item in paths])
     if array.ndim == 4 and array.shape[1] != 3 and array.shape[3] == 3:
         array = np.moveaxis(array, 3, 1)

@@ -122,12 +122,12 @@ def saliency(
     if framing is None and not turned:
         return maps
     shown = upsampled(maps, images.shape[-1])[:, None]
-    framed = images if framing is None else framing(images)
+    framed, crops = model.framed(images) if framing is not None else (images, None)
     if turned:  # back from the canonical view
         depth, camera = model.surface(framed)
         shown = warp(shown, depth, camera, model.fov_deg).image
-    if framing is not None:  # back from the crop
-        shown = crop_images(shown, back(framing.crops(images)), torch.zeros_like(shown))
+    if crops is not None:  # back from the crop
+        shown = crop_images(shown, back(crops), torch.zeros_like(shown))
     return adaptive_avg_pool2d(shown, maps.shape[-1])[:, 0]
 
 

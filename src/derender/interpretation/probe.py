@@ -193,9 +193,7 @@ def load_probe(folder: str | Path) -> Probe:
     """
     folder = Path(folder)
     if not (folder / CONFIG_FILE).is_file() or not (folder / WEIGHTS_FILE).is_file():
-        raise FileNotFoundError(
-            f"no probe at {folder}: give a folder that holds {CONFIG_FILE} and {WEIGHTS_FILE}"
-        )
+        raise FileNotFoundError(f"no probe at {folder}: give a folder with {CONFIG_FILE} and {WEIGHTS_FILE}")
     try:
         facts = read_json(folder / CONFIG_FILE, _ProbeFile)
         if facts.format > FORMAT:

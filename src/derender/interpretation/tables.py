@@ -65,9 +65,7 @@ def cluster_shares(
     """
     names = np.unique(clusters)
     if len(names) < 2:
-        raise ValueError(
-            f"a cluster needs others to compare with: {len(clusters)} rows form {len(names)} cluster"
-        )
+        raise ValueError(f"a cluster is compared with others: {len(clusters)} rows form {len(names)} cluster")
     member, count = np.asarray(clusters)[:, None] == names, len(clusters)  # (N, C)
     sizes = member.sum(axis=0)
     centred = [np.asarray(v, np.float64) - np.asarray(v, np.float64).mean(axis=0) for v in features.values()]

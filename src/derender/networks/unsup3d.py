@@ -124,9 +124,7 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
             raise ValueError(f"light has {len(light)} layers")
         return NetworkSettings(**sizes)
     except (IndexError, ValueError, StopIteration) as error:
-        raise ValueError(
-            f"{file} has networks of another kind than unsup3d's ({error}): not imported"
-        ) from error
+        raise ValueError(f"{file} has other networks than unsup3d's ({error}): not imported") from error
 
 
 def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Path) -> dict[str, Tensor]:

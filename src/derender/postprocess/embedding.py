@@ -29,6 +29,7 @@ from derender.render import Rendering, unwarp
 from derender.scene import Scene
 from derender.scene.brightness import BrightnessPrior
 from derender.scene.camera import constant
+from derender.scene.crop import back, crop_images, crop_scene
 from derender.storage.places import FITTING_FILE, WHITENING_FILE
 
 FEW, MOST = 4, 64
@@ -155,6 +156,21 @@ class EmbeddingModel(nn.Module):
         prior = self.settings.brightness
         return scene if prior is None else prior(scene)
 
+    def framed(
+        self, images: Float[Tensor, "n 3 h w"]
+    ) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n 2 3"] | None]:
+        """Images in the crops in which the model expects its object, and the crops if it looks for them."""
+        if self.whitening is None or self.whitening.framing is None:
+            return images, None
+        crops = self.whitening.framing.crops(images)
+        return crop_images(images, crops), crops
+
+    def placed(self, scene: Scene, crops: Float[Tensor, "n 2 3"] | None) -> Scene:
+        """The scenes that whole images show, of scenes found in ``crops`` of them: cameras move back."""
+        if crops is None or "camera" not in scene.parameters:
+            return scene
+        return crop_scene(scene, back(crops), self.settings.ranges.fov_deg)
+
     def with_brightness(self: Model, prior: BrightnessPrior | None) -> Model:
         """A model that shares these weights, with another prior."""
         model = self.with_features(self.features)
@@ -197,13 +213,12 @@ class EmbeddingModel(nn.Module):
         `coordinates_of`. Without ``codes`` factors whose features take another crop or view lack theirs.
         """
         check_images(images, self.image_size)
-        framing = None if self.whitening is None else self.whitening.framing
-        framed = None if framing is None else framing(images)
+        framed, _ = self.framed(images)
         known: dict[str, Any] = {"framed": framed, "codes": codes}
         result = {f.name: self.factor_activations(f.name, images, **known) for f in self.factors}
         if self.features.fits_scenes:
             steps = self.features.required_fitting().settings.steps
-            fitted = self._fitted(images if framed is None else framed, steps).coordinates
+            fitted = self._fitted(framed, steps).coordinates
             result |= {coordinates_of(name): value for name, value in fitted.items()}
         return result
 
@@ -235,7 +250,7 @@ class EmbeddingModel(nn.Module):
     def surface(
         self, images: Float[Tensor, "n 3 h w"]
     ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n 6"]]:
-        """Depth and camera of images in 0..1, as ``decompose`` finds them."""
+        """Depth and camera of images in 0..1, as ``decompose`` finds them in images in its crops."""
         nets, rows = dict[str, Any](self.nets), {row.parameter: row for row in self.factors}
         depth, camera = (
             rows[kind].to_parameter(nets[rows[kind].name](images), self.settings.ranges)
@@ -245,7 +260,7 @@ class EmbeddingModel(nn.Module):
 
     def canonical_view(self, images: GivenImages) -> Float[Tensor, "n 3 h w"]:
         """The images' own pixels on their surface, seen from the front (`unwarp`); images as for `embed`."""
-        return self.frontal(as_batch(images, self.image_size, next(self.parameters()).device))
+        return self.frontal(self.framed(as_batch(images, self.image_size, next(self.parameters()).device))[0])
 
     def frontal(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
         """The canonical view of images of the model's size; renderings may exceed 1."""
@@ -263,12 +278,14 @@ class EmbeddingModel(nn.Module):
         return self.features(self.codes(activations), activations)
 
     def fit_scenes(self, images: GivenImages, steps: int = STEPS) -> Fitted:
-        """Scenes optimised per image, from ``decompose`` on, downhill through the renderer.
+        """Scenes optimised per image, from ``decompose`` on and in its crops, downhill through the renderer.
 
         Some five times as slow as ``decompose``, with a smaller error. On a CPU a scene depends neither on
         other images nor on threads. Without a fitting (``derender whiten`` makes one): a ValueError.
         """
-        return self._fitted(as_batch(images, self.image_size, next(self.parameters()).device), steps)
+        framed, crops = self.framed(as_batch(images, self.image_size, next(self.parameters()).device))
+        fitted = self._fitted(framed, steps)
+        return replace(fitted, scene=self.placed(fitted.scene, crops))
 
     def _fitted(self, images: Float[Tensor, "n 3 h w"], steps: int) -> Fitted:
         fitting, nets = self.features.required_fitting(), dict[str, Any](self.nets)

@@ -42,13 +42,9 @@ _SWAP = Column("swap", "high", 2, "move of the exchanged feature over the others
 _DECODED = Column("decoded", "high", 2, "the same of decoded depth, albedo, light and camera")
 _MIG = Column("MIG", "high", note="mutual information gap")
 _SUMMARY = {  # by attribute of ``FeatureScores``
-    "pearson.mean_per_image": Column(
-        "PCC image", note="Pearson between two vectors of an image, -1..1, best 0"
-    ),
+    "pearson.mean_per_image": Column("PCC image", note="Pearson of two vectors of an image, -1..1, best 0"),
     "pearson.mean_per_dimension": Column("PCC dim", note="mean |Pearson| of dimensions over images, best 0"),
-    "similarity.mean_cka_unbiased": Column(
-        "CKA", note="linear, unbiased; about 0 if independent, 1 if equal"
-    ),
+    "similarity.mean_cka_unbiased": Column("CKA", note="linear, unbiased; 0 if independent, 1 if equal"),
     "similarity.mean_cross_r2": Column("cross R2", note="held-out variance explained by another; best 0"),
     "swap.ratio": _SWAP,
     ENDS[0]: interval_column(_SWAP, "images"),
