@@ -2,9 +2,9 @@
 
 Models are saved models or run folders that differ in their seed alone. Sets and halves are those of the
 published tables: 31 people of LFW with 20 images each, pairs of LFW and people of Extended Yale B of the test
-half. Features are as `derender.embed` gives them; the table also holds a released model, if one is named.
+half. Features are as `derender.embed` gives them.
 
-    .venv/bin/python benchmarks/seeds.py runs/seed0 runs/seed1 runs/seed2 --released faces-64 \
+    .venv/bin/python benchmarks/seeds.py runs/seed0 runs/seed1 runs/seed2 \
         --lfw lfw64.zip --pairs lfw_pairs_dev.txt --yaleb yaleb.zip --json benchmarks/results/seeds.json
 """
 
@@ -32,7 +32,6 @@ def measured(model: str, lfw: str, pairs: str, yaleb: str) -> dict[str, float]:
 def main() -> None:
     asks = parser(__doc__)
     asks.add_argument("models", nargs="+", help="trained alike, each with another seed")
-    asks.add_argument("--released", help="a model that is scored beside them")
     for name in ("lfw", "pairs", "yaleb"):
         asks.add_argument(f"--{name}", required=True)
     options = asks.parse_args()
@@ -41,9 +40,7 @@ def main() -> None:
     for model in options.models:
         rows.append(measured(model, *sets))
         print(model, rows[-1], flush=True)
-    released = measured(options.released, *sets) if options.released else {}
-    print(options.released, released)
-    publish({"benchmark": "seeds", "released": released, "rows": rows}, options.json)
+    publish({"benchmark": "seeds", "rows": rows}, options.json)
 
 
 if __name__ == "__main__":
