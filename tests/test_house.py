@@ -31,8 +31,8 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (920, 5),
 }
-TOTAL = (38_768, 239)  # on the way to (37_000, 270)
-TEST_LINES = 25_987
+TOTAL = (38_760, 239)  # on the way to (37_000, 270)
+TEST_LINES = 25_982
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -9,8 +9,6 @@ from derender.render import render_scene
 from derender.scene import Scene
 from derender.scene.crop import CropSettings, crop_images, crop_scene, random_crops, ranges_for_crops
 from derender.scene.ranges import SceneRanges
-from derender.training.batches import Batches
-from derender.training.distributed import Ranks
 
 FRAMES = CropSettings(nearer=1.15, farther=1.9, shift=0.25, roll_deg=20)
 
@@ -117,13 +115,3 @@ def test_the_share_that_is_not_framed_anew_stays_bit_for_bit():
     frames = random_crops(300, torch.Generator().manual_seed(0), CropSettings(), share=0.25)
     same = (crop_images(images, frames) == images).flatten(1).all(dim=1)
     assert 0.68 < same.float().mean() < 0.82
-
-
-def test_batches_are_framed_anew_the_same_way_every_time_and_on_several_devices():
-    images = torch.randint(0, 256, (12, 3, 8, 8), generator=torch.Generator().manual_seed(3)).byte()
-    plain, framed = (Batches(images, 6, seed=3, horizontal_flips=True, reframed=share) for share in (0, 1.0))
-    whole = framed.at(5)
-    assert torch.equal(whole, framed.at(5))
-    assert not torch.equal(whole, plain.at(5))
-    pieces = torch.cat([framed.at(5, Ranks(rank, 2)) for rank in range(2)])
-    assert torch.allclose(pieces, whole, atol=1e-6)

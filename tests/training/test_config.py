@@ -8,7 +8,7 @@ import torch
 import yaml
 
 from derender.overrides import checked, settings_by_name
-from derender.training.config import PRESETS, TrainConfig, resolve, to_yaml
+from derender.training.config import PRESETS, TrainConfig, resolve, to_yaml, without_removed
 from derender.training.derender_task import DerenderTask
 
 
@@ -92,3 +92,10 @@ def test_a_setting_of_a_group_that_was_replaced_is_refused(whole):
     inner = {"optimiser=x": "optimiser.weight_decay=1", "model={}": "model.network.width=8"}[whole]
     with pytest.raises(ValueError, match="was set as a whole before"):
         resolve("faces", [whole, inner])
+
+
+def test_settings_of_earlier_versions_load_where_they_changed_nothing():
+    earlier = {"reframed": 0.0, "reframe": {"nearer": 1.4}, "objective": {"loocc_after": 0.0}, "seed": 3}
+    assert without_removed(earlier) == {"objective": {}, "seed": 3}
+    with pytest.raises(ValueError, match="setting 'reframed' no longer exists: it can be 0.0, not 0.5"):
+        without_removed({"reframed": 0.5})

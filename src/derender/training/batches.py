@@ -11,13 +11,12 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor
 
 from derender.data.source import evenly_spaced
-from derender.scene.crop import DEFAULT_CROPS, CropSettings, crop_images, random_crops
 from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
 
 SAMPLED = 65_536  # images of a memory-mapped set that represent all of them where a few suffice
 
-_STREAMS = {"order": 1, "flip": 2, "perturb": 3, "frame": 4}
+_STREAMS = {"order": 1, "flip": 2, "perturb": 3}
 
 
 def random_stream(seed: int, purpose: str, position: int) -> Generator:
@@ -38,8 +37,6 @@ class Batches:
     seed: int  # of the order and the flips
     horizontal_flips: bool  # each image is mirrored with probability one half
     rows: Int64[np.ndarray, " k"] | None = None
-    reframed: float = 0.0  # the share of images that are shown in another crop
-    reframe: CropSettings = DEFAULT_CROPS  # and how far it is moved
 
     def __post_init__(self) -> None:
         if self.batch_size > len(self):
@@ -78,16 +75,12 @@ class Batches:
     def ready(
         self, images: UInt8[Tensor, "b 3 h w"], position: int, ranks: Ranks = ALONE
     ) -> Float[Tensor, "b 3 h w"]:
-        """What ``read`` gave for this position as float32 in 0..1, some images mirrored or cropped anew."""
+        """What ``read`` gave for this position as float32 in 0..1, some images mirrored."""
         batch = images.float() / 255
         if self.horizontal_flips:
             flip = torch.rand(self.batch_size, generator=random_stream(self.seed, "flip", position)) < 0.5
             flip = ranks.own(flip).to(batch.device, non_blocking=True)[:, None, None, None]
             batch = torch.where(flip, batch.flip(-1), batch)
-        if self.reframed:
-            generator = random_stream(self.seed, "frame", position)
-            crops = random_crops(self.batch_size, generator, self.reframe, self.reframed)
-            batch = crop_images(batch, ranks.own(crops))
         return batch
 
 
@@ -99,7 +92,7 @@ def batches_of(
     stay = isinstance(images, np.memmap) and device.type == "cpu"
     lying = torch.from_numpy(images if stay else np.ascontiguousarray(images[rows])).to(device)
     how = config.batch_size, config.seed, config.horizontal_flips
-    return Batches(lying, *how, rows if stay else None, config.reframed, config.reframe)
+    return Batches(lying, *how, rows if stay else None)
 
 
 def some_of(

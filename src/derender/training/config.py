@@ -21,7 +21,6 @@ from derender.overrides import SHORT, settings_by_name, with_changes
 from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
-from derender.scene.crop import DEFAULT_CROPS, CropSettings
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
 
@@ -123,8 +122,6 @@ class LoopSettings(Settings):
     patience: int = Field(default=10, ge=1)  # validations without improvement before stopping
     keep: Literal["best", "last"] = "best"  # the model: of the best validation, or of the last checkpoint
     horizontal_flips: bool = True  # show half of the images mirrored
-    reframed: float = Field(default=0.0, ge=0, le=1)  # share of the images shown in another crop
-    reframe: CropSettings = DEFAULT_CROPS
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     precision: Literal["32-true", "bf16-mixed"] = "32-true"  # networks only; geometry is always float32
     channels_last: bool = True  # memory layout of networks: speed only
@@ -190,7 +187,10 @@ class FinetuneConfig(TrainConfig):
     checkpoint_every: int = Field(default=5_000, ge=1)
 
 
-REMOVED: dict[str, Any] = {"objective.loocc_after": 0.0, "whitening.frames": 0, "whitening.reframe": ...}
+REMOVED: dict[str, Any] = {
+    "objective.loocc_after": 0.0, "reframe": ..., "reframed": 0.0, "whitening.frames": 0,
+    "whitening.reframe": ...,
+}  # fmt: skip
 """Settings of earlier versions: runs that have them at this value (...: at any) still load."""
 
 _CHANGES = yaml.safe_load(Path(__file__).with_name("presets.yaml").read_text(encoding="utf-8"))
@@ -243,8 +243,8 @@ def as_overrides(tree: Mapping[str, Any]) -> list[str]:
 def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
     """Stored settings without those of ``REMOVED``; a value this version cannot honour is a ValueError."""
     for key, neutral in REMOVED.items():
-        parent, last = key.split(".")
-        part = tree.get(parent)
+        *parents, last = key.split(".")
+        part = tree.get(parents[0]) if parents else tree
         value = part.pop(last, neutral) if isinstance(part, dict) else neutral
         if value != neutral and neutral is not ...:
             raise ValueError(
