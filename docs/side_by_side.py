@@ -71,6 +71,7 @@ ALIGNED = "published/verification-aligned.json"
 LFW, LFW_FITTED = "published/lfw.json", "published/lfw-fitted.json"
 UTK_IMAGES, LFW_IMAGES = "published/reconstruction-utkface.json", "published/reconstruction-lfw.json"
 BRIGHT, IDENTITY = "generated/brightness.json", "published/identity.json"
+IDENTITY_128 = {IDENTITY: "published/identity-128.json"}
 BINS = {"to 50°": ("<= 50", False), "to 77°": ("<= 77", True), "beyond": ("beyond", True)}
 DESCRIPTORS = ("Gradientfaces", "HOG", "LBP")
 PLAIN = ("untrained encoder", "PCA (64)", "pixels")
@@ -123,7 +124,12 @@ SIDE_BY_SIDE: dict[str, tuple[str, Reader]] = {
     "identity": side_by_side(
         {name: Score(IDENTITY, "rows", key, intervals=wide) for name, (key, wide) in BINS.items()}
         | {"Ward": Score(IDENTITY, "rows", "ward accuracy")},
-        [*lines("geometry + albedo", control=False), *lines(*PLAIN, *DESCRIPTORS, "chance")],
+        [
+            *lines("geometry + albedo", control=False),
+            *lines(*PLAIN, *DESCRIPTORS, "chance"),
+            Line("`faces-128`, 128 pixels", ("geometry + albedo",), IDENTITY_128),
+            *(Line(f"{name}, 128 pixels (control)", (name,), IDENTITY_128) for name in DESCRIPTORS[:2]),
+        ],
     ),
     "brightness": side_by_side(
         {

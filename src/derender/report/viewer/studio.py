@@ -86,7 +86,7 @@ class Studio:
     def about(self) -> dict[str, Any]:
         """The model's name and abilities, ranges of the camera, examples, table, bound of the shelf."""
         ranges, rows, table = self.model.settings.ranges, self.model.factors, None
-        reaches = (ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.1))
+        reaches = (ranges.translation_xy, ranges.translation_xy, max(ranges.translation_z, 0.4))
         if self.gallery is not None:
             factors = [name for name in self.gallery.table.factors if name in self.model.nets]
             note = self.gallery.without_pictures
