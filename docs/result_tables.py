@@ -66,8 +66,15 @@ SUMMARY = (
         "31 people of LFW, accuracy",
         "{people|geometry + albedo|LFW}",
         "LBP with mirror image {people|LBP with mirror image (control)|LFW}",
-        "beyond 77°: Gradientfaces {identity|Gradientfaces (control)|beyond} to "
-        "{identity|geometry + albedo|beyond}",
+        "nothing",
+    ),
+    (
+        "9 people of Yale B, light to 77°",
+        "{identity|geometry + albedo|to 77°}",
+        "Gradientfaces {identity|Gradientfaces (control)|to 77°}",
+        "beyond {identity|Gradientfaces (control)|beyond} to {identity|geometry + albedo|beyond}; "
+        "128 pixels {identity|Gradientfaces, 128 pixels (control)|to 77°} to "
+        "{identity|`faces-128`, 128 pixels|to 77°}",
     ),
     (
         "19 face parts from 640 masks, mIoU",
@@ -312,7 +319,8 @@ KILLED_AS = {"identify": "evaluate identify", "plan": "compare --plan", "video":
 FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for the reader
     "segmentation": (" ".join(MASKS.values()), segmented),
     "summary": (
-        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json {CARS} {MASKS[640]} {MASKS[100]}",
+        f"{HEADS_FILE} generated/people.json {LFW} published/identity.json published/identity-128.json "
+        f"{CARS} {MASKS[640]} {MASKS[100]}",
         summary,
     ),
     "faces-128": ("sharpness.json", sharp),
