@@ -108,12 +108,12 @@ class Derenderer(EmbeddingModel, Shareable):
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One code per factor for images in 0..1, by factor name: what ``decode`` takes."""
         check_images(images, self.image_size)
-        return {f.name: self.nets[f.name].encoder(images) for f in self.factors}  # type: ignore[operator]
+        return {f.name: self.nets[f.name].encoder(images) for f in self.factors}
 
     def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene:
         """The scene that codes stand for."""
-        nets, ranges = dict(self.nets.items()), self.settings.ranges
-        raw = {f.name: nets[f.name].decoder(codes[f.name]) for f in self.factors}  # type: ignore[operator]
+        ranges = self.settings.ranges
+        raw = {f.name: self.nets[f.name].decoder(codes[f.name]) for f in self.factors}
         return Scene.from_parameters({f.parameter: f.to_parameter(raw[f.name], ranges) for f in self.factors})
 
     def decompose(self, images: GivenImages) -> Scene:

@@ -122,7 +122,7 @@ class EmbeddingModel(nn.Module):
     """Images to features; ``features`` (whitening, fitting) are exchanged by ``with_features``."""
 
     factors: tuple[Factor, ...]
-    nets: nn.ModuleDict
+    nets: Any  # a `FactorNet` for each, by name, in an `nn.ModuleDict`
     settings: ModelSettings
 
     def __init__(self, features: Features | None):
@@ -232,7 +232,7 @@ class EmbeddingModel(nn.Module):
         ``codes``. ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default
         where ``features`` take them. ``framed`` are the images in their crops, if they are known.
         """
-        net, parts = dict[str, Any](self.nets)[name], list[Tensor]()
+        net, parts = self.nets[name], list[Tensor]()
         framing, shown = self.features.framing(name), images
         if framing is not None:
             shown = framing(images) if framed is None else framed
@@ -251,9 +251,9 @@ class EmbeddingModel(nn.Module):
         self, images: Float[Tensor, "n 3 h w"]
     ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n 6"]]:
         """Depth and camera of images in 0..1, as ``decompose`` finds them in images in its crops."""
-        nets, rows = dict[str, Any](self.nets), {row.parameter: row for row in self.factors}
+        rows = {row.parameter: row for row in self.factors}
         depth, camera = (
-            rows[kind].to_parameter(nets[rows[kind].name](images), self.settings.ranges)
+            rows[kind].to_parameter(self.nets[rows[kind].name](images), self.settings.ranges)
             for kind in ("depth", "camera")
         )
         return depth, camera
@@ -269,7 +269,7 @@ class EmbeddingModel(nn.Module):
     def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that activations begin with: ``encode`` of the same images."""
         names = [factor.name for factor in self.factors if factor.name in activations]
-        return {name: activations[name][:, : self.nets[name].code_size] for name in names}  # type: ignore[misc]
+        return {name: activations[name][:, : self.nets[name].code_size] for name in names}
 
     def features_from(
         self, activations: Mapping[str, Float[Tensor, "n _"]]
@@ -288,7 +288,7 @@ class EmbeddingModel(nn.Module):
         return replace(fitted, scene=self.placed(fitted.scene, crops))
 
     def _fitted(self, images: Float[Tensor, "n 3 h w"], steps: int) -> Fitted:
-        fitting, nets = self.features.required_fitting(), dict[str, Any](self.nets)
+        fitting, nets = self.features.required_fitting(), self.nets
         rows = [row for row in self.factors if not (row.mirrored or row.parameter in ("light", "camera"))]
         ranged = [lambda raw, own=row: own.to_parameter(raw, self.settings.ranges) for row in rows]
         with torch.no_grad():

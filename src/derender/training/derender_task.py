@@ -91,12 +91,11 @@ class DerenderTask(TrainingTask):
         require_perceptual(self.config.objective)
         model, start = Derenderer.seeded(self.config.model, self.config.seed), self.config.start_from
         for factor in model.factors if self.config.maps_only else ():
-            net: Any = model.nets[factor.name]
+            net = model.nets[factor.name]
             (net.encoder if factor.mirrored else net).requires_grad_(False)
         if self.config.geometry_start != GEOMETRY_START:
-            decoder: Any = model.nets["geometry"].decoder
             with torch.no_grad():
-                decoder.last.weight.mul_(self.config.geometry_start / GEOMETRY_START)
+                model.nets["geometry"].decoder.last.weight.mul_(self.config.geometry_start / GEOMETRY_START)
         if start is not None and self.begins:
             try:
                 weights = {k: v for k, v in model.state_dict().items() if ".growth." in k}

@@ -143,7 +143,7 @@ def fit_whitening(
             for factor in vectors if exchangeable else ():  # maps are exchanged within the batch
                 rest = [other for other in model.factors if other.name != factor.name]
                 shown = renderings(model, scene, batch, rest, perturb, others, settings.views)
-                codes = [model.nets[factor.name].encoder(one).float() for one in shown]  # type: ignore[operator]
+                codes = [model.nets[factor.name].encoder(one).float() for one in shown]
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     size = size or model.settings.network.code_size
     shrinkage, power = settings.shrinkage, settings.vector_power

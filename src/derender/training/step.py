@@ -177,7 +177,7 @@ def cycle_loss(
     total = rendered.depth.new_zeros(())
     for factor in loocc_factors(objective.loocc, model.factors):
         if not factor.mirrored:
-            raw = model.nets[factor.name].decoder(codes_again[factor.name].float())  # type: ignore[operator]
+            raw = model.nets[factor.name].decoder(codes_again[factor.name].float())
             predicted = factor.to_parameter(raw, model.settings.ranges)
             total = total + (predicted - rendered.parameters[factor.parameter].detach()).abs().mean()
     return total
