@@ -1,10 +1,13 @@
 """The base of every settings class: frozen, strict about names and types; values as JSON."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 from pydantic_core import to_jsonable_python
+
+ONE_OR_MANY = BeforeValidator(lambda one: (one,) if isinstance(one, str) else one)
+Names = Annotated[tuple[str, ...], ONE_OR_MANY]
 
 
 class Settings(BaseModel):

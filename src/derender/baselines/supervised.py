@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from pydantic import Field, field_validator
+from pydantic import Field
 from torch import Generator, Tensor
 from torch.nn.functional import cross_entropy
 
@@ -19,7 +19,7 @@ from derender.baselines.model import BaselineModel, BaselineSettings, Features, 
 from derender.baselines.simclr import AugmentSettings, augment
 from derender.data import ImageSet, as_float, split_indices
 from derender.features import map_batches, missing
-from derender.settings import Settings
+from derender.settings import Names, Settings
 from derender.storage.places import optional
 from derender.training.task import TrainResult
 
@@ -39,7 +39,7 @@ class SupervisedConfig(Settings):
     """One training: AdamW, the rate falling along a cosine to 0; no validation, no early stop."""
 
     baseline: Literal["resnet18"] = "resnet18"
-    labels: tuple[str, ...] = ()  # label columns to learn; at least one
+    labels: Names = ()  # label columns to learn; at least one
     labelled: int = Field(default=1_000, ge=2)  # images whose labels are used
     image_size: int = Field(default=64, ge=32)
     width: int = Field(default=64, ge=1)
@@ -50,11 +50,6 @@ class SupervisedConfig(Settings):
     augment: AugmentSettings = MILD
     split: tuple[float, float, float] = (0.8, 0.1, 0.1)  # train, validation, test
     seed: int = Field(default=0, ge=0)
-
-    @field_validator("labels", mode="before")
-    @classmethod
-    def _one_or_many(cls, value: object) -> object:
-        return (value,) if isinstance(value, str) else value
 
 
 class Resnet18(BaselineModel):

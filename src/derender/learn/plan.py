@@ -5,7 +5,6 @@ anything is trained.
 """
 
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +13,7 @@ from pydantic import BeforeValidator, Field, StringConstraints
 from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
 from derender.features import named
 from derender.overrides import checked
-from derender.settings import Settings
+from derender.settings import ONE_OR_MANY, Names, Settings
 from derender.storage.bounded import YAML_LIMIT, parse_yaml, read_text
 from derender.training.config import as_overrides, resolve
 
@@ -31,8 +30,6 @@ def _methods(given: Any) -> Any:
     return {name: one or {} for name, one in given.items()} if isinstance(given, dict) else given
 
 
-ONE_OR_MANY = BeforeValidator(lambda one: (one,) if isinstance(one, str) else one)
-Names = Annotated[tuple[str, ...], ONE_OR_MANY]
 Name = Annotated[str, StringConstraints(pattern=r'^[^/\\:*?"<>|.][^/\\:*?"<>|]*$')]  # a folder's, too
 
 
@@ -135,43 +132,44 @@ def read_plan(path: str | Path) -> Plan:
     try:
         text = read_text(path, YAML_LIMIT)
         plan = checked(tomllib.loads(text) if path.suffix == ".toml" else parse_yaml(text), Plan)
-        for fault in _faults(plan):
-            raise ValueError(fault)
+        _check(plan)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as a plan: {error}") from error
     return plan
 
 
-def _faults(plan: Plan) -> Iterator[str]:
-    """What in a plan does not fit the rest of it; unknown names raise."""
+def _check(plan: Plan) -> None:
+    """A ValueError where something in a plan does not fit the rest of it."""
     if not (plan.methods and plan.score):
-        yield "a plan needs at least one of methods: and one of score:"
+        raise ValueError("a plan needs at least one of methods: and one of score:")
     for name, method in plan.methods.items():
         kind, learns = plan.kind(name), {"settings", "settings_on", "runs"}
         if plan.methods[plan.source(name)].like is not None:
-            yield f"method {name!r} is like {method.like!r}, which is like another: name that one"
+            raise ValueError(f"method {name!r} is like {method.like!r}, which is like another: name that one")
         why, barred = f"({kind}) is not trained here", {*learns, "model"} if kind in CONTROLS else learns
         if method.like is not None:
             why, barred = f"is like {method.like!r}", {*learns, "model", "kind"}
         elif plan.is_trained(name):
             barred = set()
         if extra := sorted(barred & method.model_fields_set):
-            yield f"method {name!r} {why}: leave out {', '.join(extra)}"
+            raise ValueError(f"method {name!r} {why}: leave out {', '.join(extra)}")
         for where in (*method.runs, *method.settings_on):
             named(plan.train, where, "training set")
     trained = [method for method in plan.rows() if plan.is_trained(method)]
     for name, scored in plan.score.items():
         where, part, needs = scored.trained_on, scored.part != "all", f"score {name!r} needs"
         if (scored.table is None) == (not scored.label):
-            yield f"{needs} a table (identity, emotion, ...) or a label, not both"
+            raise ValueError(f"{needs} a table (identity, emotion, ...) or a label, not both")
         if where is None:
             if trained or part:
-                yield f"{needs} trained_on: the training set of {', '.join(trained) or 'its part'}"
+                raise ValueError(
+                    f"{needs} trained_on: the training set of {', '.join(trained) or 'its part'}"
+                )
             continue
         learnt = named(plan.train, where, "training set")
         same = all(getattr(scored, key) == getattr(learnt, key) for key in ImageSource.model_fields)
         if part and (not same or plan.seeds > 1):
-            yield f"{needs} seeds: 1 and the data, dataset and limit of {where!r} for its part"
+            raise ValueError(f"{needs} seeds: 1 and the data, dataset and limit of {where!r} for its part")
         for method in trained:
             if plan.methods[method].like is None and where not in plan.methods[method].runs:
                 plan.configuration(method, where, 0)  # raises where a setting does not fit
