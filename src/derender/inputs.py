@@ -10,9 +10,10 @@ import torch
 
 from derender.data import ImageSet, Progress, read_images, split_indices
 from derender.model import Derenderer, load
+from derender.overrides import checked
 from derender.storage.folder import SplitRecord, read_split, write_split
 from derender.storage.places import DEVICES, model_folder, require_known
-from derender.training.config import TrainConfig
+from derender.training.config import LoopSettings
 from derender.training.run_folder import read_config_tree
 
 PARTS = ("all", "train", "validation", "test")
@@ -90,10 +91,8 @@ def split_of(model: str | Path) -> SplitRecord | None:
     """The split of a run, or of the run that a saved model comes from; None where it is not recorded."""
     if (Path(model) / "config.yaml").is_file():
         recorded = read_config_tree(Path(model))
-        default = TrainConfig.model_fields
-        shares, seed = (recorded.get(key, default[key].get_default()) for key in ("split", "seed"))
-        train, validation, test = (float(share) for share in shares)
-        return SplitRecord((train, validation, test), int(seed))
+        own = checked({key: recorded[key] for key in ("split", "seed") if key in recorded}, LoopSettings)
+        return SplitRecord(own.split, own.seed)
     try:
         return read_split(model_folder(model))
     except FileNotFoundError:

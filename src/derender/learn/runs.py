@@ -120,9 +120,8 @@ def train(
 
     how = {"resume": resume, "progress": report, "accelerator": accelerator, "sample_sheet": sheet}
     result = (derender_task.train if ours else train_baseline)(config, images, out, **how)
-    writes = this_rank_writes()
     leave()
-    if writes and page:
+    if page and this_rank_writes():
         from derender.report.evidence import Evidence, look_at_data
         from derender.report.run import run_page
 

@@ -140,7 +140,7 @@ def first_to_fail() -> bool:
     if started_together() == 1 or not distributed.is_available():
         return True
     if not distributed.is_initialized():
-        return os.environ.get("RANK", "0") == "0"  # before they know of each other all fail alike
+        return this_rank_writes()  # before they know of each other all fail alike
     return distributed.distributed_c10d._get_default_store().add("derender/failed", 1) == 1
 
 
@@ -152,6 +152,4 @@ def leave() -> None:
 
 def this_rank_writes() -> bool:
     """Whether this process is the one that writes files: the only one, or the first of several."""
-    if distributed.is_initialized():
-        return distributed.get_rank() == 0
-    return "LOCAL_WORLD_SIZE" not in os.environ or os.environ.get("RANK", "0") == "0"
+    return started_together() == 1 or os.environ.get("RANK", "0") == "0"
