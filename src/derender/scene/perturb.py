@@ -57,11 +57,8 @@ def perturb_camera(
     return torch.cat([turned, camera[:, 2:]], dim=1)
 
 
-def exchange(
-    value: Shaped[Tensor, "n ..."], generator: Generator, settings: PerturbSettings = DEFAULT_CHANGES,
-    ranges: SceneRanges = DEFAULT_RANGES,
-) -> Shaped[Tensor, "n ..."]:  # fmt: skip
-    """Give every row another row's value, for factors without a range; the last two are not consulted."""
+def exchange(value: Shaped[Tensor, "n ..."], generator: Generator, *_: object) -> Shaped[Tensor, "n ..."]:
+    """Give every row another row's value, for factors without a range."""
     return value[derangement(len(value), generator).to(value.device)]
 
 

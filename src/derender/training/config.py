@@ -28,16 +28,15 @@ from derender.settings import Settings
 def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
     """The factors that a kind of LOOCC perturbs: "none", "all", or names joined by +; else a ValueError."""
     able = {factor.name: factor for factor in factors if factor.perturb is not None}
-    if kind in ("none", "all"):
-        return list(able.values()) if kind == "all" else []
-    for name in kind.split("+"):
+    asked = {"none": (), "all": able}.get(kind, kind.split("+"))
+    for name in asked:
         if name not in able:
             raise ValueError(
                 f"setting 'objective.loocc': {name!r} is no factor that this model perturbs"
                 f"{suggestion(name, able)}: write none, all, or some of {', '.join(able)} joined by +, such "
                 "as light+camera"
             )
-    return [factor for name, factor in able.items() if name in kind.split("+")]
+    return [factor for name, factor in able.items() if name in asked]
 
 
 class ObjectiveSettings(Settings):
@@ -161,10 +160,9 @@ class TrainConfig(LoopSettings):
     @property
     def features(self) -> FeatureSettings:
         """How features are estimated once training has ended."""
-        how = {name: getattr(self, name) for name in ("whitening", "fitting", "brightness")}
-        if self.maps_only:  # activations are those of the start
-            how["whitening"] = self.whitening.model_copy(update={"pictures": 0})
-        return FeatureSettings(perturb=self.objective.perturb, **how)
+        none = {"pictures": 0} if self.maps_only else {}  # activations are those of the start
+        how = {"fitting": self.fitting, "perturb": self.objective.perturb, "brightness": self.brightness}
+        return FeatureSettings(whitening=self.whitening.model_copy(update=none), **how)
 
 
 class TargetSettings(Settings):
