@@ -124,6 +124,9 @@ class EmbeddingModel(nn.Module):
     factors: tuple[Factor, ...]
     nets: Any  # a `FactorNet` for each, by name, in an `nn.ModuleDict`
     settings: ModelSettings
+    encode: Callable[[Float[Tensor, "n 3 h w"]], dict[str, Float[Tensor, "n code"]]]
+    decode: Callable[[Mapping[str, Float[Tensor, "n code"]]], Scene]
+    render: Callable[[Scene], Rendering]
 
     def __init__(self, features: Features | None):
         super().__init__()
@@ -144,12 +147,6 @@ class EmbeddingModel(nn.Module):
     @property
     @abstractmethod
     def image_size(self) -> int: ...
-
-    @abstractmethod
-    def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]: ...
-
-    @abstractmethod
-    def decode(self, codes: Mapping[str, Float[Tensor, "n code"]]) -> Scene: ...
 
     def balanced(self, scene: Scene) -> Scene:
         """A decoded scene whose brightness the model's prior, if any, shares between albedo and light."""
@@ -176,9 +173,6 @@ class EmbeddingModel(nn.Module):
         model = self.with_features(self.features)
         model.settings = model.settings.model_copy(update={"brightness": prior})
         return model
-
-    @abstractmethod
-    def render(self, scene: Scene) -> Rendering: ...
 
     @property
     def features(self) -> Features:
