@@ -17,6 +17,7 @@ that of the maps at the image's size, each divided by its largest value.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -148,15 +149,10 @@ def _at_features(
     made of the canonical view they are that view's.
     """
     seen: list[Tensor] = []
-    with torch.enable_grad():
-        hook = model.nets[factor].encoder.to_code.register_forward_pre_hook(
-            lambda _, inputs: seen.append(inputs[0].requires_grad_())
-        )
-        try:
-            active = model.factor_activations(factor, images)
-        finally:
-            hook.remove()
-        answer = score(model.features_from({factor: active})[factor], weight).sum()
+    to_code = model.nets[factor].encoder.to_code
+    look = to_code.register_forward_pre_hook(lambda _, given: seen.append(given[0].requires_grad_()))
+    with torch.enable_grad(), look:
+        answer = _answer(model, factor, images, weight).sum()
         seen = seen[-2 if model.features.mirrors(factor) else -1 :]  # before them the surface was decoded
         gradients = torch.autograd.grad(answer, seen)
     return torch.cat(seen).detach(), torch.cat(gradients)
@@ -166,18 +162,18 @@ def pixel_attribution(
     model: Any, images: Float[Tensor, "n 3 h w"], factor: str, weight: Tensor | None
 ) -> Float[Tensor, "n h w"]:
     """|IG| of the pixels from a grey image, summed over colours."""
-
-    def answer(pixels: Tensor, own: Tensor | None = None) -> Tensor:
-        active = model.factor_activations(factor, pixels)
-        return score(model.features_from({factor: active})[factor], own)
-
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():
-        result = captum_attr().IntegratedGradients(answer).attribute(
+        result = captum_attr().IntegratedGradients(partial(_answer, model, factor)).attribute(
             images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS,
             internal_batch_size=max(len(images), 64),
         )  # fmt: skip
     return result.detach().abs().sum(dim=1).to(images)
+
+
+def _answer(model: Any, factor: str, images: Tensor, weight: Tensor | None = None) -> Float[Tensor, " n"]:
+    active = model.factor_activations(factor, images)
+    return score(model.features_from({factor: active})[factor], weight)
 
 
 def upsampled(maps: Float[Tensor, "n y x"], size: int) -> Float[Tensor, "n size size"]:
