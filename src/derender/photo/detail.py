@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from derender.photo.frame import look_up, sampled
 from derender.render import Rendering, warp
@@ -272,9 +272,9 @@ class PhotoDetail:
         visible = inside & (points[..., 2][:, None] <= front + HIDDEN_BEHIND) & (front > 0)
         share = visible * _ramp(_facing(points), *FACING)[:, None]
         reach = max(1, round(FEATHER_SHARE * self.grid))
-        return avg_pool2d(
-            _eroded(share, reach), 2 * reach + 1, stride=1, padding=reach, count_include_pad=False
-        )
+        least = cv2.erode(share[0, 0].cpu().numpy(), np.ones((2 * reach + 1, 2 * reach + 1)))
+        share = torch.from_numpy(least).to(share)[None, None]
+        return avg_pool2d(share, 2 * reach + 1, stride=1, padding=reach, count_include_pad=False)
 
     def _found_object(self, own: Scene, points: Tensor) -> Float[Tensor, "1 1 w w"]:
         """How surely each canonical point is the object and not what is behind it, 0..1."""
@@ -374,13 +374,6 @@ def _averaged(maps: Tensor, reach: int) -> Tensor:
     for _ in range(3):
         maps = avg_pool2d(pad(maps, (reach,) * 4, mode="replicate"), (2 * reach + 1, 1), stride=1)
         maps = avg_pool2d(maps, (1, 2 * reach + 1), stride=1)
-    return maps
-
-
-def _eroded(maps: Tensor, reach: int) -> Tensor:
-    """The least value within ``reach`` pixels across and down."""
-    for across, down in ((reach, 0), (0, reach)):
-        maps = -max_pool2d(-maps, (2 * down + 1, 2 * across + 1), stride=1, padding=(down, across))
     return maps
 
 
