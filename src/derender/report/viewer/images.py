@@ -11,7 +11,6 @@ is read only from its beginning, so its images are not shown.
 """
 
 import secrets
-import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -60,8 +59,7 @@ class ShownImage:
 class Shelf:
     """Opened images by names that cannot be guessed: at most ``limit``, and ``limit_bytes`` of photographs.
 
-    When it is full, the image leaves that was not requested for longest; the last two stay. Safe to use from
-    several threads.
+    When it is full, the image leaves that was not requested for longest; the last two stay.
     """
 
     def __init__(self, limit: int = KEPT, limit_bytes: int = KEPT_BYTES):
@@ -69,7 +67,6 @@ class Shelf:
             raise ValueError(f"a shelf needs room for 2 images or more, for swaps; got {limit}")
         self.limit, self.limit_bytes = limit, limit_bytes
         self._images: OrderedDict[str, ShownImage] = OrderedDict()
-        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._images)
@@ -77,12 +74,11 @@ class Shelf:
     def put(self, image: ShownImage) -> str:
         """Store an image; returns its name."""
         name = secrets.token_urlsafe(16)
-        with self._lock:
-            self._images[name] = image
-            while len(self._images) > self.limit or (
-                len(self._images) > 2 and self._kept_bytes() > self.limit_bytes
-            ):
-                self._images.popitem(last=False)
+        self._images[name] = image
+        while len(self._images) > self.limit or (
+            len(self._images) > 2 and self._kept_bytes() > self.limit_bytes
+        ):
+            self._images.popitem(last=False)
         return name
 
     def _kept_bytes(self) -> int:
@@ -90,13 +86,10 @@ class Shelf:
 
     def get(self, name: str) -> ShownImage:
         """The image of that name, which now counts as used; ``Refused`` (410) if it has left."""
-        with self._lock:
-            if name not in self._images:
-                raise Refused(
-                    410, f"this image is no longer stored (the last {self.limit} are): open it again"
-                )
-            self._images.move_to_end(name)
-            return self._images[name]
+        if name not in self._images:
+            raise Refused(410, f"this image is no longer stored (the last {self.limit} are): open it again")
+        self._images.move_to_end(name)
+        return self._images[name]
 
 
 @dataclass(frozen=True)
