@@ -91,9 +91,8 @@ def on_background(image: Image.Image) -> Image.Image:
     """An opaque RGB copy, white where the image is transparent."""
     if image.mode != "RGBA":
         return image.convert("RGB")
-    filled = Image.new("RGB", image.size, "white")
-    filled.paste(image, mask=image.getchannel("A"))
-    return filled
+    white = Image.new("RGB", image.size, "white")
+    return Image.composite(image.convert("RGB"), white, image.getchannel("A"))
 
 
 def enlarged(image: Image.Image, width: int) -> Image.Image:

@@ -222,8 +222,7 @@ def write_image_file(
         raise ValueError(f"{out} is the image itself: name another file as --out")
     if out.exists() and resume:
         return WrittenImages(out, [], [], {}, {}, before=1)
-    if out.exists() and not force:
-        raise FileExistsError(f"{out} exists already: choose another --out, or add --force to replace it")
+    _require_free([out], out.parent, False, force)
     with tempfile.TemporaryDirectory() as folder, atomic_file(out) as temporary:
         how = {**how, "force": force, "sheet": False}
         written = write_images(opener, [image], Path(folder) / "images", edit, **how)
