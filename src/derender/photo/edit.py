@@ -24,7 +24,7 @@ from derender.inputs import as_model
 from derender.model import Derenderer
 from derender.photo.detail import PhotoDetail
 from derender.photo.faces import PROFILE_DEG, UTKFACE, face_candidates, frame_of, template_of
-from derender.photo.frame import Frame
+from derender.photo.frame import Frame, resized
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.crop import SEARCH_SCALE, best_crop
@@ -80,15 +80,11 @@ class Photograph:
 
     def at_most(self, side: int) -> "Photograph":
         """The same with its longer side at most so many pixels."""
-        height, width = self.pixels.shape[:2]
-        share = side / max(height, width)
-        if share >= 1:
+        if (share := side / max(self.pixels.shape[:2])) >= 1:
             return self
-        size = max(1, round(width * share)), max(1, round(height * share))
-        small = np.asarray(Image.fromarray(self.pixels).resize(size, Image.Resampling.LANCZOS))
-        x, y, side = (share * value for value in (self.frame.x, self.frame.y, self.frame.side))
-        frame = Frame(x, y, side, self.frame.roll_deg)
-        return Photograph.of(small, frame, self.scene, self.detail)
+        x, y, across = (share * value for value in (self.frame.x, self.frame.y, self.frame.side))
+        frame = Frame(x, y, across, self.frame.roll_deg)
+        return Photograph.of(resized(self.pixels, side), frame, self.scene, self.detail)
 
     @torch.inference_mode()
     def __call__(self, scene: Scene) -> Rendering:
@@ -203,7 +199,7 @@ def relight(
         ValueError: no face is found, or the image has values outside 0..1.
     """
     loaded = as_model(model)
-    _check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
+    check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     if not 0 <= strength < float("inf"):
         raise ValueError(f"strength must be 0 or more, got {strength}")
     opened = partial(open_photograph, model=loaded, frame=frame, fit_steps=fit_steps)
@@ -230,7 +226,7 @@ def rotate(
         What was given, in kind and size; a list for a list.
     """
     loaded = as_model(model)
-    _check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
+    check_angles(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     opened = partial(open_photograph, model=loaded, frame=frame, fit_steps=fit_steps)
     return _each(image, lambda one: opened(one).rotated(yaw_deg, pitch_deg))
 
@@ -294,10 +290,13 @@ def _squares(middle: Frame, width: int, height: int) -> list[Frame]:
     return [middle, *(replace(middle, **{along: float(place)}) for place in places if steps)]
 
 
-def _check_angles(**angles: float) -> None:
-    for name, angle in angles.items():
+def check_angles(**angles_deg: float) -> None:
+    """Raise ValueError where an angle of a light or a view is no less than a right one."""
+    for name, angle in angles_deg.items():
         if not -90 < angle < 90:
-            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {angle:g}")
+            raise ValueError(
+                f"{name} must lie between -90 and 90 degrees, got {angle:g}: give a smaller angle"
+            )
 
 
 def _each(image: GivenImages, edit: Callable[[np.ndarray], np.ndarray]) -> Any:

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from PIL import Image
 
-from derender.photo.frame import Frame
+from derender.photo.frame import Frame, resized
 from derender.photo.yaw import CROP, CROP_SIDE, yaw_deg
 
 LARGEST_SIDE = 1024
@@ -83,12 +82,8 @@ def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
     """
     if photo.dtype != np.uint8 or photo.ndim != 3:
         raise ValueError(f"expected bytes (H, W, 3), got {photo.dtype} of shape {photo.shape}: convert them")
-    height, width = photo.shape[:2]
-    scale = max(1.0, max(height, width) / LARGEST_SIDE)
-    small = photo
-    if scale > 1:
-        size = round(width / scale), round(height / scale)
-        small = np.asarray(Image.fromarray(photo).resize(size, Image.Resampling.LANCZOS))
+    scale = max(1.0, max(photo.shape[:2]) / LARGEST_SIDE)
+    small = resized(photo, LARGEST_SIDE) if scale > 1 else photo
     candidates: list[Face] = []
     for quarter in range(4):
         turned = np.ascontiguousarray(np.rot90(small, -quarter))

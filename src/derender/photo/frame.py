@@ -150,6 +150,14 @@ class Frame:
         return pasted
 
 
+def resized(photo: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """The photograph with its longer side of so many pixels, antialiased."""
+    height, width = photo.shape[:2]
+    share = side / max(height, width)
+    size = max(1, round(width * share)), max(1, round(height * share))
+    return np.asarray(Image.fromarray(photo).resize(size, Image.Resampling.LANCZOS))
+
+
 def sampled(
     maps: Float[Tensor, "n c h w"], places: Float[Tensor, "n r k 2"], align_corners: bool = False, **how: str
 ) -> Float[Tensor, "n c r k"]:

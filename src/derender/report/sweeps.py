@@ -19,7 +19,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from derender.features import named
-from derender.photo.edit import AMBIENT_SHARE
+from derender.photo.edit import AMBIENT_SHARE, check_angles
 from derender.photo.video import write_video
 from derender.render import Rendering
 from derender.report.colours import Images, image_bytes, on_background, pictures
@@ -122,11 +122,7 @@ def _light(strength: float, pitch: Tensor, yaw: Tensor) -> Float[Tensor, "k 4"]:
 
 def _around(t: Tensor, reach_deg: float, pitch_deg: float) -> tuple[Tensor, Tensor]:
     """Pitch and yaw in radians, from one side to the other."""
-    for name, angle_deg in (("reach", reach_deg), ("pitch", pitch_deg)):
-        if not -90 < angle_deg < 90:
-            raise ValueError(
-                f"{name} must lie between -90 and 90 degrees, got {angle_deg}: give a smaller angle"
-            )
+    check_angles(reach=reach_deg, pitch=pitch_deg)
     return torch.full_like(t, radians(pitch_deg)), radians(reach_deg) * (2 * t - 1)
 
 

@@ -29,6 +29,7 @@ from derender.model import Derenderer
 from derender.photo import Frame, PhotoDetail, Photograph, find_faces, found_frame
 from derender.photo.edit import MARGIN
 from derender.photo.faces import frame_of, template_of
+from derender.photo.frame import resized
 from derender.postprocess.fitting import STEPS
 from derender.report import colours
 from derender.report.colours import image_bytes
@@ -115,8 +116,8 @@ class Studio:
         ``pixels`` are what the model is given, where that is known already. The percentile is that of the
         feed-forward reconstruction.
         """
-        if (longer := max(photo.shape[:2])) > LARGEST_PHOTO:
-            photo = _resized(photo, LARGEST_PHOTO / longer)
+        if max(photo.shape[:2]) > LARGEST_PHOTO:
+            photo = resized(photo, LARGEST_PHOTO)
         template, faces = template_of(self.model), ()
         if pixels is None and template is not None and min(photo.shape[:2]) > self.model.image_size:
             faces = tuple(frame_of(face, template).snapped() for face in find_faces(photo))
@@ -214,7 +215,7 @@ class Studio:
     def preview(self, question: ViewRequest) -> bytes:
         """The whole photograph, small enough for the page."""
         photo = self.shelf.get(question.picture).photo
-        return _encoded(Image.fromarray(_resized(photo, min(1.0, PREVIEW_SIZE / max(photo.shape[:2])))))
+        return _encoded(Image.fromarray(resized(photo, min(PREVIEW_SIZE, max(photo.shape[:2])))))
 
     def picture(self, question: ViewRequest) -> bytes:
         """The whole photograph, edited, at its own size as PNG; or what the model renders."""
@@ -332,7 +333,7 @@ class Studio:
             left, right = max(0, int(min(across))), min(width, ceil(max(across)))
             top, bottom = max(0, int(min(down))), min(height, ceil(max(down)))
         scale = size / max(right - left, bottom - top)
-        pixels = _resized(opened.photo[top:bottom, left:right], scale)
+        pixels = resized(opened.photo[top:bottom, left:right], size)
         place = Frame((frame.x - left) * scale, (frame.y - top) * scale, frame.side * scale, frame.roll_deg)
         return Photograph.of(pixels, place, opened.scene, self.model)
 
@@ -344,13 +345,6 @@ class Studio:
 def _source(question: ViewRequest) -> str:
     """The image that gives the colours."""
     return dict(question.swaps).get("albedo", question.picture)
-
-
-def _resized(photo: UInt8[np.ndarray, "h w 3"], scale: float) -> UInt8[np.ndarray, "h2 w2 3"]:
-    if scale == 1:
-        return photo
-    size = max(1, round(photo.shape[1] * scale)), max(1, round(photo.shape[0] * scale))
-    return np.asarray(Image.fromarray(photo).resize(size, Image.Resampling.LANCZOS))
 
 
 def _encoded(image: Image.Image) -> bytes:
