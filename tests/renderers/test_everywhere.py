@@ -72,7 +72,7 @@ def test_panels_swaps_relighting_and_meshes_show_further_factors(model, generato
     relit_like = derender.relight(images[0], model, like=images[1], fit_steps=0)
     expected = torch.from_numpy(photo.edited(**light)).permute(2, 0, 1) / 255
     torch.testing.assert_close(relit_like, expected, atol=0.01, rtol=0)
-    moved = relit_video(reach_deg=60, pitch_deg=0, strength=1, like=other, hold=True)(scene)
+    moved = relit_video(scene, reach_deg=60, pitch_deg=0, strength=1, like=other, hold=True)
     assert torch.equal(moved[parameter], light[parameter].expand(2, -1))
 
 

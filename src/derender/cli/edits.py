@@ -30,7 +30,7 @@ def relight(
     moves: dict[str, Any] = {"reach_deg": reach, "pitch_deg": pitch, "strength": strength}
     moves["like"] = others[0] if others else None
     edit = partial(relit, opener.model, **moves, film=film.single(files.suffix))
-    video = relit_video(**moves, hold=film.hold)
+    video = partial(relit_video, **moves, hold=film.hold)
     files.edit(opener, edit, output, beside=others, video=video)
 
 
@@ -46,7 +46,7 @@ def rotate(
     opener = model.opener(how, EDIT_SIZE, whole=True)
     moves = {"reach_deg": reach, "pitch_deg": pitch}
     edit = partial(rotated, opener.model, **moves, film=film.single(files.suffix))
-    files.edit(opener, edit, output, video=rotated_video(**moves, hold=film.hold))
+    files.edit(opener, edit, output, video=partial(rotated_video, **moves, hold=film.hold))
 
 
 @command("swap", "swap --model runs/faces me.jpg --from you.jpg --factor albedo --out mixed/")

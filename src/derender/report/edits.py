@@ -139,26 +139,19 @@ def swapped_factors(
 
 
 def relit_video(
-    *, reach_deg: float, pitch_deg: float, strength: float, like: OpenedImage | None, hold: bool,
-) -> VideoEdit:  # fmt: skip
+    scene: Scene, *, reach_deg: float, pitch_deg: float, strength: float, like: OpenedImage | None,
+    hold: bool,
+) -> dict[str, Tensor]:  # fmt: skip
     """A light that goes round while a video plays, or stands still; arguments as for ``relit``."""
-
-    def edit(scene: Scene) -> dict[str, Tensor]:
-        if like is not None:
-            return {name: light.expand(len(scene), -1) for name, light in like.scene.lighting.items()}
-        return {"light": _lights(scene, _over_time(scene, hold), reach_deg, pitch_deg, strength)}
-
-    return edit
+    if like is not None:
+        return {name: light.expand(len(scene), -1) for name, light in like.scene.lighting.items()}
+    return {"light": _lights(scene, _over_time(scene, hold), reach_deg, pitch_deg, strength)}
 
 
-def rotated_video(*, reach_deg: float, pitch_deg: float, hold: bool) -> VideoEdit:
+def rotated_video(scene: Scene, *, reach_deg: float, pitch_deg: float, hold: bool) -> dict[str, Tensor]:
     """A turn to either side on top of what the object does, while a video plays."""
-
-    def edit(scene: Scene) -> dict[str, Tensor]:
-        turn = sweeps.cameras_around(_over_time(scene, hold), reach_deg, pitch_deg)
-        return {"camera": scene.camera + turn.to(scene.camera)}
-
-    return edit
+    turn = sweeps.cameras_around(_over_time(scene, hold), reach_deg, pitch_deg)
+    return {"camera": scene.camera + turn.to(scene.camera)}
 
 
 def swapped_video(parameters: Sequence[str], donor: OpenedImage) -> VideoEdit:
