@@ -39,10 +39,6 @@ _GLASS = np.array([0.15, 0.38, 0.62, 0.85, 1.0])
 _SIDE = np.array([0.05, 0.13, 0.26, 0.4, 0.55, 0.7, 0.85, 1.0])
 _ROUND = np.array([0.42, 0.32, 0.16, 0.26, 0.26, 0.16, 0.28, 0.42])  # stations, most of each inner corner
 _DOWN, _FLIP = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
-_WHEEL_RINGS = np.array([  # distance outwards along the axle in wheel widths, radius in wheel radii
-    (-0.16, 0.0), (-0.16, 0.18), (-0.2, 0.5), (-0.08, 0.66), (0.0, 0.74), (0.0, 0.88), (-0.1, 0.985),
-    (-0.25, 1.0), (-0.75, 1.0), (-1.0, 0.9), (-1.0, 0.0),
-])  # fmt: skip
 _TURN = np.linspace(0.0, 2.0 * np.pi, 25)
 
 
@@ -180,7 +176,7 @@ def wheel(
 ) -> Grid:
     """A wheel whose outer face looks to the right (+x), or to the rear; ``centre`` is that face's middle. Its
     chart is in wheel radii."""
-    out, r = _WHEEL_RINGS.T[..., None]
+    out, r = np.transpose(numbers_of("cars")["wheel_rings"])[..., None]
     up, side = radius * r * np.cos(_TURN), -radius * r * np.sin(_TURN)
     axle = np.broadcast_to(out * width, up.shape)
     share = np.where(np.arange(len(r))[:, None] < 8, r, 1.2)

@@ -245,12 +245,6 @@ def word(finish: Finish, v: float, half: float, tall: float) -> list[Decal]:
     return [decal for u0, u1 in u.tolist() for decal in box(finish, u0, v - tall / 2, u1, v + tall / 2)]
 
 
-def cross(finish: Finish, u: float, v: float, across: float, along: float) -> list[Decal]:
-    """Two bars, as far from (u, v) along each coordinate."""
-    arms = (0.32 * across, along), (across, 0.32 * along)
-    return [decal for x, y in arms for decal in box(finish, u - x, v - y, u + x, v + y)]
-
-
 def star(finish: Finish, u: float, v: float, across: float, along: float) -> list[Decal]:
     """Six arms, as far from (u, v) along each coordinate."""
     decals = []
@@ -263,30 +257,20 @@ def star(finish: Finish, u: float, v: float, across: float, along: float) -> lis
 
 
 SHAPES: Mapping[str, Callable[..., list[Decal]]] = {
-    one.__name__: one for one in (polygon, inside, box, line, ellipse, checker, word, cross, star)
+    one.__name__: one for one in (polygon, inside, box, line, ellipse, checker, word, star)
 }
 
 
 def side_paint(car: CarTraits) -> list[Decal]:
     """Shapes on both sides."""
-    s, lines, doors = car.shape, body_lines(car.shape, np.linspace(0.0, 9.0, 181)), _door_edges(car)
-    waist = [float(lines.waist[np.argmin(np.abs(lines.waist[:, 2] - at)), 1]) for at in doors]
-    middle, handle = 0.55 * waist[0] + 0.45 * s.sill, car.finish("handle", "trim")
-    decals = shapes("side", car, doors_from=doors[0], doors_to=doors[-1])
-    for at, y in zip(doors, waist, strict=True):
-        decals += line(car.finish(0.5), at, s.sill + 0.08, at, y, 0.03, 0)
-    for at, y in zip(doors[1:], waist[1:], strict=True):
-        decals += box(handle, at - 0.27, y - 0.12, at - 0.1, y - 0.08)
-    decals += line(car.finish(0.8), doors[0], middle, doors[-1] + 0.3, middle + 0.04, 0, 0.03)
-    if not car.has(["open"]):
-        decals += _windows(car, lines, doors)
+    lines, doors = body_lines(car.shape, np.linspace(0.0, 9.0, 181)), _door_edges(car)
+    edges = dict(zip(("doors_from", "post", "rear_post"), doors[:-1], strict=False), doors_to=doors[-1])
+    nearest = {name: np.argmin(np.abs(lines.waist[:, 2] - at)) for name, at in edges.items()}
+    places = edges | {f"{name}_waist": float(lines.waist[row, 1]) for name, row in nearest.items()}
     rows = (40, 48) if car.name == "sports" else (35, 41) if car.has(["narrow lamps"]) else (31, 40)
-    (_, ay, az), (_, by, bz) = lines.edge[list(rows)].tolist()
-    front = (az - 0.1, ay, az + 0.12, ay + 0.01, bz + 0.26, by - 0.03, bz - 0.1, by + 0.05)
-    (_, ay, az), (_, by, bz) = lines.edge[[150, 140]].tolist()
-    rear = (az + 0.1, ay, az - 0.12, ay + 0.02, bz - 0.22, by - 0.06, bz + 0.1, by + 0.02)
-    lamps = polygon(car.finish("lamp", "light"), *front) if car.name != "jeep" else []
-    return [*decals, *lamps, *polygon(car.finish("red", "light"), *rear), *shapes("arches", car)]
+    for name, row in zip(("lamp", "lamp_end", "rear", "rear_end"), (*rows, 150, 140), strict=True):
+        places[f"{name}_y"], places[f"{name}_z"] = lines.edge[row, 1:].tolist()
+    return shapes("side", car, **places) + ([] if car.has(["open"]) else _windows(car, lines, doors))
 
 
 def _door_edges(car: CarTraits) -> list[float]:
