@@ -16,7 +16,7 @@ from numpy import ndarray
 from derender.data import MASK_CLASSES, Progress
 from derender.data.synthetic.face_shape import ACTIONS, LID_ACTIONS, Expression, face_shape
 from derender.data.synthetic.face_skin import built_in_person, skin_fields
-from derender.data.synthetic.morphable import MorphableFaces
+from derender.data.synthetic.morphable import MeshOf, MorphableFaces
 from derender.data.synthetic.settings import EXPRESSIONS, FaceSettings, ViewSettings, drawn, pick
 from derender.data.synthetic.synthetic_set import Row, Shot, SyntheticSet, draw_background, make_set
 
@@ -41,19 +41,18 @@ def generate(
 
     def shots(indices: list[int]) -> Iterator[Shot]:
         number = settings.first_identity + indices[0] // settings.per_identity
-        mesh_of, known, traits = person(seed, number, settings)
-        for index in indices:
-            expression, background, light, camera, labels = draw_face(seed, index, image_size, settings)
-            yield Shot(mesh_of(expression), background, light, camera, number, labels | known, traits)
+        made = person(seed, number, settings)
+        return (draw_face(seed, index, image_size, settings, number, *made) for index in indices)
 
     size = settings.per_identity
     return make_set(shots, count, image_size, seed, first, size, MASK_CLASSES, progress, settings.effects)
 
 
 def draw_face(
-    seed: int, index: int, image_size: int, settings: FaceSettings
-) -> tuple[Expression, ndarray, ndarray, ndarray, Row]:
-    """Expression, background, light, camera and labels of image number ``index``."""
+    seed: int, index: int, image_size: int, settings: FaceSettings, number: int, mesh_of: MeshOf, known: Row,
+    traits: Row,
+) -> Shot:  # fmt: skip
+    """Image ``index`` of person ``number``: expression, light, view and background."""
     track, frame = divmod(index % settings.per_identity, settings.frames) if settings.tracks else (0, 0)
     along = frame / max(settings.frames - 1, 1)
     along = along * along * (3.0 - 2.0 * along)  # between two draws, smoothly in time
@@ -75,16 +74,12 @@ def draw_face(
     light = settings.light.draw(uniform[1:6])
     labels: Row = {"expression": name, "strength": strength}
     if settings.tracks:
-        kind = "yaw" if abs(light[3]) >= abs(light[2]) else "pitch"
-        labels = {"track": track, "frame": frame, **labels, "light_kind": kind}
-    background = settings.backgrounds[int(uniform[6] * len(settings.backgrounds))]
-    return (
-        Expression(name, strength, sides.astype(np.float32), gaze.astype(np.float32)),
-        draw_background(background, generator, image_size),
-        light,
-        camera.astype(np.float32),
-        labels,
-    )
+        side = "yaw" if abs(light[3]) >= abs(light[2]) else "pitch"
+        labels = {"track": track, "frame": frame, **labels, "light_kind": side}
+    mesh = mesh_of(Expression(name, strength, sides.astype(np.float32), gaze.astype(np.float32)))
+    kind = settings.backgrounds[int(uniform[6] * len(settings.backgrounds))]
+    background = draw_background(kind, generator, image_size)
+    return Shot(mesh, background, light, camera.astype(np.float32), number, labels | known, traits)
 
 
 def _camera(view: ViewSettings, normal: ndarray, uniform: ndarray) -> ndarray:
