@@ -87,16 +87,14 @@ def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:
     An objection needs certainty: a value past ``objects`` by less than two errors is only trouble.
     """
     sign = 1 if check.noted is None else -1  # so that more is better
-    objects, struggles = (None if one is None else sign * one for one in (check.objects, check.struggles))
+    objects, struggles = (-np.inf if one is None else sign * one for one in (check.objects, check.struggles))
     middle, margin = sign * value.value, 2 * value.error
-    if objects is not None and middle < objects:
+    if middle < objects:
         return ("objection", True) if middle + margin < objects else ("trouble", False)
-    if struggles is not None and middle < struggles:
-        certain = middle + margin < struggles and (objects is None or middle - margin >= objects)
-        return "trouble", certain
-    least = struggles if struggles is not None else objects
+    if middle < struggles:
+        return "trouble", middle + margin < struggles and middle - margin >= objects
     noted = check.noted is not None and value.value > check.noted
-    return "note" if noted else "good", least is None or middle - margin >= least
+    return "note" if noted else "good", middle - margin >= max(objects, struggles)
 
 
 def finding_of(name: str, value: JackknifeEstimate, detail: str = "") -> CheckFinding:

@@ -193,12 +193,10 @@ def edge_cells(grey: Grey) -> Cells:
     right = grey[:, 1:-1, 2:] - grey[:, 1:-1, :-2]
     strength = np.sqrt(np.hypot(right, down))
     place = np.mod(np.arctan2(down, right), np.pi) * (ORIENTATIONS / np.pi)
-    lower = np.floor(place).astype(int) % ORIENTATIONS
-    to_upper = (place - np.floor(place)).astype(np.float32)
     cells = np.empty((len(grey), CELLS, CELLS, ORIENTATIONS), np.float32)
-    for orientation in range(ORIENTATIONS):
-        is_lower, is_upper = lower == orientation, (lower + 1) % ORIENTATIONS == orientation
-        share = is_lower * (1 - to_upper) + is_upper * to_upper
+    for orientation in range(ORIENTATIONS):  # shared linearly by the two nearest
+        away = np.abs(place - orientation)
+        share = np.maximum(1 - np.minimum(away, ORIENTATIONS - away), 0)
         blocks = (strength * share).reshape(len(grey), CELLS, _CELL_PX, CELLS, _CELL_PX)
         cells[..., orientation] = blocks.sum(axis=(2, 4))
     return cells
