@@ -23,6 +23,7 @@ from derender.storage.bounded import parse_json
 
 FORMAT = 1
 METADATA_KEY = b"derender"
+_LISTS = pa.ListType, pa.LargeListType, pa.FixedSizeListType
 
 
 def refuse_folder(path: Path) -> None:
@@ -81,7 +82,7 @@ def read_table(path: Path, only: str | None = None) -> FeatureTable:
         opened = opened_parquet(path)
         schema = opened.schema_arrow
     described = _described(schema.metadata, path)
-    lists = [name for name in schema.names if name != "file" and _is_list(schema.field(name).type)]
+    lists = [name for name in schema.names if name != "file" and isinstance(schema.field(name).type, _LISTS)]
     names = described.get("factors", lists)
     factors = names if only is None else [named(dict.fromkeys(names, only), only, "factor")]
     with _readable(path):
@@ -129,14 +130,10 @@ def _described(metadata: Mapping[bytes, bytes] | None, path: Path) -> dict[str, 
     return described
 
 
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-
-
 def factor_values(column: pa.ChunkedArray, name: str, path: Path) -> np.ndarray:
     """A column of equally long lists of numbers as (N, D) float32."""
     where = f"{path}: factor {name!r}"
-    if not _is_list(column.type):
+    if not isinstance(column.type, _LISTS):
         raise ValueError(f"{where} is a column of {column.type}, expected a list of numbers in each row")
     if column.null_count:
         raise ValueError(f"{where} is empty in {column.null_count} rows: drop these rows")

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
-from pydantic import AfterValidator, Field
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, field_validator
 from torch import Tensor, nn
 
 from derender.settings import Settings
@@ -92,12 +92,6 @@ def read_weights(folder: Path, build: Callable[[], Net]) -> Net:
     return network
 
 
-def _ascending(values: list[float]) -> list[float]:
-    if sorted(values) != values:
-        raise ValueError("quantiles do not ascend")
-    return values
-
-
 @contextmanager
 def naming_damage(folder: Path) -> Iterator[None]:
     """Turn what a damaged file raises into one sentence that names the folder."""
@@ -113,12 +107,15 @@ class HeldOutErrors(Settings):
 
     format: Literal[1] = 1
     measure: str = "mean absolute difference inside the mask, 0..1"
-    pictures: int = Field(ge=0)
-    quantiles: Annotated[
-        list[Annotated[float, Field(ge=0)]],
-        Field(min_length=QUANTILES, max_length=QUANTILES),
-        AfterValidator(_ascending),
-    ]
+    pictures: NonNegativeInt
+    quantiles: list[NonNegativeFloat] = Field(min_length=QUANTILES, max_length=QUANTILES)
+
+    @field_validator("quantiles")
+    @classmethod
+    def _ascending(cls, values: list[float]) -> list[float]:
+        if sorted(values) != values:
+            raise ValueError("quantiles do not ascend")
+        return values
 
 
 @dataclass(frozen=True)
