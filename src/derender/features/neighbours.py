@@ -167,8 +167,6 @@ def _distances(query: np.ndarray, rows: np.ndarray, metric: Any) -> Float64[np.n
     """From one feature (D,) to each of (N, D) rows."""
     from scipy.spatial.distance import cdist
 
-    away = np.empty(len(rows))
-    for start in range(0, len(rows), BLOCK_ROWS):
-        part = slice(start, start + BLOCK_ROWS)
-        away[part] = cdist(query[None], rows[part], metric)[0]
+    blocks = (rows[start : start + BLOCK_ROWS] for start in range(0, len(rows), BLOCK_ROWS))
+    away = np.concatenate([np.empty(0), *(cdist(query[None], block, metric)[0] for block in blocks)])
     return np.nan_to_num(away.clip(0), nan=1.0)  # the cosine of zeros

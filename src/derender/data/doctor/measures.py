@@ -36,7 +36,7 @@ _CELL_PX = 5
 _MIRRORED = [0, *range(ORIENTATIONS - 1, 0, -1)]
 _MARGIN, _REACH = 0.02, 14  # of the axis of symmetry
 _SPLITS, _SPLIT_COMPONENTS, _STARTS, _SMALLEST = 8, 16, 3, 5
-_MIDDLE = slice(10, 16), slice(16, 22)  # of 32 pixels, on either side of the middle
+_MIDDLE = slice(10, 22)  # of 32 pixels
 _CHUNK = 256
 _COLOURLESS = 4.0  # mean distance of the channels, in values of 255: below it no colour is seen
 _BLANK = 2.0  # standard deviation of grey, in values of 255: below it there is nothing to see
@@ -113,7 +113,7 @@ def shrunk(images: UInt8[np.ndarray, "n 3 s s"]) -> Grey:
     return _averaged(np.tensordot(images.astype(np.float32), _WEIGHTS / 255, axes=(1, 0)), GREY_PX)
 
 
-def _averaged(grey: Float32[np.ndarray, "n h w"], side: int) -> Float32[np.ndarray, "n t t"]:
+def _averaged(grey: Float[np.ndarray, "n h w"], side: int) -> Float[np.ndarray, "n t t"]:
     block = grey.shape[-1] // side
     return grey.reshape(len(grey), side, block, side, block).mean(axis=(2, 4))
 
@@ -258,12 +258,8 @@ def frame_filled(structure: Cells) -> float:
 
 def side_light(grey: Grey) -> Float[np.ndarray, "n 2"]:
     """(left - right) / (left + right) of the middle's upper and lower half, -1..1; above 0: lit from left."""
-    low, high = _MIDDLE
-    halves = []
-    for rows in (low, high):
-        left, right = (grey[:, rows, side].mean(axis=(1, 2), dtype=np.float64) for side in (low, high))
-        halves.append((left - right) / (left + right + 0.02))
-    return np.stack(halves, axis=1)
+    left, right = np.moveaxis(_averaged(grey[:, _MIDDLE, _MIDDLE].astype(np.float64), 2), 2, 0)
+    return (left - right) / (left + right + 0.02)
 
 
 def light_variety(sides: Float[np.ndarray, "n 2"]) -> float:
@@ -277,7 +273,6 @@ def symmetry_axis(grey: Grey) -> SymmetryAxis:
     """Look for an axis in steps of half a pixel, up to 7 pixels away; it has to beat the middle by 0.02."""
     right, down = np.gradient(grey, axis=2), np.gradient(grey, axis=1)
     mean = np.sqrt(np.hypot(right, down)).mean(axis=0, dtype=np.float64)
-    mean -= mean.mean(axis=1, keepdims=True)
     width = mean.shape[1]
     result: dict[int, float] = {}
     for twice in range(-_REACH, _REACH + 1):  # twice the distance, in pixels of the small image

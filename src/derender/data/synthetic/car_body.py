@@ -147,13 +147,11 @@ def rounded_box(
 
     ``surfaces`` are those of top (chart x, z), front and rear (x, y) and sides (z, y).
     """
-    sizes, rim = np.asarray(half, float), _box_faces()
-    core = sizes - min(radius, *half)
-    flat = np.where(np.abs(rim) > 0.4, np.sign(rim) * core, 0.0)
-    outward = unit(np.where(np.abs(rim) > 0.9, np.sign(rim), 0.0))
+    rim, edge = _box_faces(), min(radius, *half)
+    flat, outward = np.sign(rim) * (np.asarray(half, float) - edge), unit(np.trunc(rim))
     cos, sin = np.cos(lean_rad), np.sin(lean_rad)
     turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-    points = (flat + (sizes - core).min() * outward) @ turn.T + np.asarray(centre, float)
+    points = (flat + edge * outward) @ turn.T + np.asarray(centre, float)
     normals = -(outward @ turn.T) * _DOWN
     top, front, rear, side = surfaces
     faces = ((top, [0, 2]), (front, [0, 1]), (rear, [0, 1]), (side, [2, 1]), (side, [2, 1]))

@@ -311,11 +311,8 @@ def _cast_shadows(
     more, holes = np.zeros((len(points), 8), np.float32), np.zeros((0, 2, 3), np.float32)
     for lamp, across, nearest in zip(light.lamps, light.across, light.maps, strict=True):
         direction = lamp[1:].astype(float)
-        first = np.cross((0.0, 1.0, 0.0) if abs(direction[1]) < 0.9 else (1.0, 0.0, 0.0), direction)
-        first /= np.linalg.norm(first)
+        first = unit(np.cross((0.0, 1.0, 0.0) if abs(direction[1]) < 0.9 else (1.0, 0.0, 0.0), direction))
         across[:] = scale * np.stack([first, np.cross(direction, first)])
-        places = np.empty((len(points), 3), np.float32)
-        places[:, :2] = points @ across.T + 0.5 * (size - 1)
-        places[:, 2] = 1 - points @ lamp[1:]
+        places = np.column_stack([points @ across.T + 0.5 * (size - 1), 1 - points @ lamp[1:]])
         owner = np.empty(nearest.shape, np.int32)
         fill_triangles(places, mesh.triangles, mesh.number[:0], more, holes, nearest, owner)
