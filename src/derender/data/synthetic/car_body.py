@@ -14,7 +14,7 @@ grid's columns and rows are ordered so that d/dcolumn x d/drow points inwards. L
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,13 +74,12 @@ class CarShape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What is on one chart: colour and part where no shape lies, shapes (later ones on top); ``folded`` and
-    ``holes`` as in Paint."""
+    """What is on one chart: colour and part where no shape lies, shapes (later ones on top), holes as in
+    Paint."""
 
     colour: Colour
     part: str = "trim"
     decals: Sequence[Decal] = ()
-    folded: bool = False
     holes: Sequence[tuple[float, float, float]] = ((0.0, 0.0, 0.0),) * 2
 
 
@@ -122,7 +121,6 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
         paint=Paint(
             colour=np.array([s.colour for s in surfaces], np.float32),
             part=np.array([PARTS.index(s.part) for s in surfaces], np.int32),
-            folded=np.array([s.folded for s in surfaces]),
             holes=np.array([s.holes for s in surfaces], np.float32),
             first=np.cumsum([0, *(len(s.decals) for s in surfaces)]).astype(np.int32),
             decals=np.array(rows, np.float32).reshape(-1, DECAL_LENGTH),
@@ -158,7 +156,6 @@ def rounded_box(
     return [Grid(points[i], normals[i], points[i][..., axes], s) for i, (s, axes) in enumerate(faces)]
 
 
-@lru_cache(maxsize=1)
 def _box_faces() -> ndarray:
     """(5, 4, 4, 3), top, front, rear, right, left: 1 marks the rounded rim of a face, 0.5 its flat inside,
     with the sign of the side."""
@@ -248,15 +245,15 @@ def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
 def body_pieces(
     shape: CarShape, top: Surface, side: Surface
 ) -> tuple[list[Grid], Float[ndarray, "points 3"]]:
-    """The body, and the points of its right side. Top's chart is (share of the half width, station), side's
-    (z, y)."""
+    """The body, and the points of its right side. Top's chart is (share of the half width to either side,
+    station), side's (z, y)."""
     between = [i + np.arange(n) / n for i, n in enumerate(_ROWS_BETWEEN)]
     bed = [BED_FROM, BED_FROM + 0.01, BED_TO, BED_TO + 0.01]
     stations = np.sort(np.concatenate([*between, [float(_LAST)], bed]))
     half = _half(shape, stations)
     points = np.concatenate([half[:, :0:-1] * _FLIP, half], axis=1)[::-1]
     across = np.concatenate([_ACROSS, np.ones(len(_GLASS) + len(_SIDE))])
-    share = np.concatenate([-across[:0:-1], across])
+    share = np.concatenate([across[:0:-1], across])
     above = np.stack(np.broadcast_arrays(share[None], stations[::-1, None]), axis=-1)
     whole, middle, beside = smooth_grid(points, above, top), half.shape[1] - 1, points[..., [2, 1]]
     first, last = middle - len(_ACROSS) + 1, middle + len(_ACROSS)

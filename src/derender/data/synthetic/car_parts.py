@@ -121,7 +121,7 @@ def build_car(car: CarTraits) -> TriangleMesh:
     wheels = (s.front_wheel, s.rear_wheel)
     holes = [(at, s.wheel, 0.0 if jeep else ARCH * s.wheel) for at in wheels]
     side = Surface(car.paint, "body", side_paint(car), holes=holes)
-    pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car), folded=True), side)
+    pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car)), side)
     tyre = Surface(car.colour("tyre"), "wheel", shapes("wheel", car))
     template = wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
     for at in wheels:

@@ -25,21 +25,19 @@ DECAL_LENGTH = _OWN + 2 * MOST_CORNERS
 class Paint(NamedTuple):
     """Surfaces as arrays: k has rows ``first[k]`` to ``first[k + 1]`` of ``decals``.
 
-    ``folded`` takes a chart's first coordinate without its sign, so that paint is symmetric. ``holes`` are
-    circles (u, v, radius) where there is no surface, of radius 0 where there is no hole.
+    ``holes`` are circles (u, v, radius) where there is no surface, of radius 0 where there is no hole.
     """
 
     colour: ndarray  # (surfaces, 3) float32
     part: ndarray  # (surfaces,) int32
-    folded: ndarray  # (surfaces,) bool
     holes: ndarray  # (surfaces, 2, 3) float32
     first: ndarray  # (surfaces + 1,) int32
     decals: ndarray  # (decals, DECAL_LENGTH) float32
 
 
 NO_PAINT = Paint(
-    *(np.zeros((1, 3), np.float32), np.zeros(1, np.int32), np.zeros(1, bool)),
-    *(np.zeros((1, 2, 3), np.float32), np.zeros(2, np.int32), np.zeros((0, DECAL_LENGTH), np.float32)),
+    *(np.zeros((1, 3), np.float32), np.zeros(1, np.int32), np.zeros((1, 2, 3), np.float32)),
+    *(np.zeros(2, np.int32), np.zeros((0, DECAL_LENGTH), np.float32)),
 )
 
 

@@ -37,7 +37,7 @@ class Lighting(NamedTuple):
 
 @kernel
 def light_at(lighting, place, normal, span, result):
-    """Light on a point with an inward normal: fills ``found`` in the order of ``EFFECTS``.
+    """Light on a point with an inward normal: fills ``result`` in the order of ``EFFECTS``.
 
     ``place`` is column, row, depth, focal length and side of the image; ``span`` the least and greatest depth
     that are seen.

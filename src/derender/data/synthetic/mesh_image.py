@@ -251,9 +251,7 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, span,
             if painted:
                 at = _seen_at(places, mesh.triangles, np.uint32(f), np.float32(u), np.float32(v))
                 surface[s] = mesh.number[f]
-                p = _blend(more, 3, at)
-                spot[0, s] = abs(p) if mesh.paint.folded[surface[s]] else p
-                spot[1, s] = _blend(more, 4, at)
+                spot[0, s], spot[1, s] = _blend(more, 3, at), _blend(more, 4, at)
         if painted and seen:
             paint_samples(mesh.paint, surface, spot, inside, colour, part)
         for n in range(3):
