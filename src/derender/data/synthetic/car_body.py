@@ -252,19 +252,14 @@ def body_pieces(
     stations = np.sort(np.concatenate([*between, [float(_LAST)], bed]))
     half = _half(shape, stations)
     points = np.concatenate([half[:, :0:-1] * _FLIP, half], axis=1)[::-1]
-    across = np.concatenate([_ACROSS, np.ones(len(_GLASS) + len(_SIDE))])
-    share = np.concatenate([across[:0:-1], across])
-    above = np.stack(np.broadcast_arrays(share[None], stations[::-1, None]), axis=-1)
-    whole, middle, beside = smooth_grid(points, above, top), half.shape[1] - 1, points[..., [2, 1]]
-    first, last = middle - len(_ACROSS) + 1, middle + len(_ACROSS)
-    pieces = [  # with the whole's normals, so that neighbours join without a crease
-        Grid(points[:, columns], whole.normals[:, columns], chart[:, columns], surface)
-        for columns, chart, surface in (
-            *((slice(0, first + 1), beside, side), (slice(first, last), above, top)),
-            (slice(last - 1, None), beside, side),
-        )
-    ]
-    return pieces, points[:, last:].reshape(-1, 3)
+    beside, across = points[..., [2, 1]], np.concatenate([_ACROSS[:0:-1], _ACROSS])
+    above = np.stack(np.broadcast_arrays(across, stations[::-1, None]), axis=-1)
+    whole, middle, edge = smooth_grid(points, beside, side), half.shape[1] - 1, len(_ACROSS) - 1
+    upper, lower = slice(middle - edge, middle + edge + 1), slice(middle + edge, None)
+    # with the whole's normals, so that neighbours join without a crease
+    deck = Grid(points[:, upper], whole.normals[:, upper], above, top)
+    right = Grid(points[:, lower], whole.normals[:, lower], beside[:, lower], side)
+    return [both([right])[1], deck, right], points[:, middle + edge + 1 :].reshape(-1, 3)
 
 
 def _table(s: CarShape) -> Float[ndarray, "stations 12"]:
