@@ -228,8 +228,6 @@ def _brows(who: Identity, grid: FaceGrid, grain: ndarray) -> Float32[ndarray, "r
 
 def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[ndarray, "rows columns"]:
     """How far a point lies inside the hair (> 0) or outside it, in face pixels."""
-    if style.cover == 0.0:
-        return np.full(grid.p.shape, -50.0)
     numbers, turn, p = numbers_of("faces"), np.rad2deg(grid.theta[0]), grid.p[0]
     away, front, parting = np.abs(turn), -31.3 + who["hair_line"], who["hair_parting"]
     rows = np.minimum(numbers["hair_lines"][style.line], style.end - front)

@@ -67,8 +67,7 @@ def draw_face(
     sides[len(ACTIONS) :] += 0.5 * settings.asymmetry * halves[len(ACTIONS) :, :1]
     sides[0] = 0.5 * sum(sides[0])  # a jaw opens as a whole
     cameras = np.stack([_camera(settings.view, n, u) for n, u in zip(normal, ends, strict=True)])
-    if settings.tracks:
-        cameras[1] = np.clip(cameras[1], cameras[0] - _DRIFT, cameras[0] + _DRIFT)
+    cameras[1] = np.clip(cameras[1], cameras[0] - _DRIFT, cameras[0] + _DRIFT)
     gaze = np.clip(normal[:, 5:], -1.8, 1.8) * settings.gaze_px * np.array([1.0, 0.35])
     camera, gaze = (start + (end - start) * along for start, end in (cameras, gaze))
     light = settings.light.draw(uniform[1:6])

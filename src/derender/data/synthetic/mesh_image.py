@@ -255,9 +255,7 @@ def _shade_samples(mesh, places, more, owner, light, background, focal_px, span,
         if painted and seen:
             paint_samples(mesh.paint, surface, spot, inside, colour, part)
         for n in range(3):
-            behind = background[i, j, n]
-            if light.haze[0] > _ZERO:
-                behind = behind * veil + air * (_ONE - veil)
+            behind = background[i, j, n] * veil + air * (_ONE - veil)
             total[n] = np.float32(_ALL - seen) * behind
         for s in range(np.uint32(_ALL if seen else 0)):
             if surface[s] < 0:
