@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import sem
 
 from derender.data.layouts.layout import in_test_half, stem_of
 from derender.evaluation import bootstrap
@@ -221,24 +222,23 @@ def verify(
     rows = subject_and_controls(features, how)
     place = {stem_of(file): row for row, file in enumerate(rows[0].tables[0].files)}
     sides = np.array([[place[name] for name in side] for side in (pairs.first, pairs.second)])
-    weights, scored, errors = how.drawn(len(pairs)), [], {}
-    for row in rows:
-        runs = [_judged(run, sides, pairs) for run in row.arrays()]
-        right = np.mean([own for own, _ in runs], axis=0)
-        accuracy = weights @ right / weights.sum(axis=1)
-        areas = np.stack([area_under_roc(cosine, pairs.same, weights) for _, cosine in runs])
-        scores = {"accuracy": bootstrap.estimate([own.mean() for own, _ in runs], accuracy[1:])}
-        scores["auc"] = bootstrap.estimate(areas[:, 0], areas[:, 1:].mean(axis=0))
-        each = [float(right[pairs.fold == fold].mean()) for fold in np.unique(pairs.fold)]
-        errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
-        scored.append(bootstrap.ScoredRow(row.name, row.control, len(runs), scores))
-    half_right = bootstrap.constant(0.5, how.resamples)
-    scored.append(bootstrap.ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
-    scored = bootstrap.with_verdicts(scored)
     columns = {
         "accuracy": Column("accuracy", "high", note="share of pairs judged right, mean over folds"),
         "auc": Column("AUC", "high", note="area under the ROC curve over all pairs"),
     }
+    weights, scored, errors = how.drawn(len(pairs)), [], {}
+    for row in rows:
+        judged = (_judged(run, sides, pairs) for run in row.arrays())
+        right, cosines = map(np.stack, zip(*judged, strict=True))
+        accuracy = right @ weights.T / weights.sum(axis=1)
+        areas = [area_under_roc(cosine, pairs.same, weights) for cosine in cosines]
+        both = np.stack((accuracy, areas), axis=2)
+        scored.append(bootstrap.scored_row(row.name, row.control, columns, both))
+        each = [right[:, pairs.fold == fold].mean() for fold in np.unique(pairs.fold)]
+        errors[row.name] = float(sem(each))
+    half_right = bootstrap.constant(0.5, how.resamples)
+    scored.append(bootstrap.ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
+    scored = bootstrap.with_verdicts(scored)
     error = Column("± SE", None, note="standard error of accuracy over folds")
     n_folds, n_same = len(set(pairs.fold.tolist())), int(pairs.same.sum())
     caption = (

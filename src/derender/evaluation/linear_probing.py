@@ -223,13 +223,11 @@ def compare_linear(
 
     def scored(name: str, answers: np.ndarray) -> bootstrap.ScoredRow:
         """Scores of (S, T, A) answers; average precision has no interval."""
+        both = ("accuracy", "balanced_accuracy")
         counted = np.stack([count_scores(truth, answer, task.kind, weights) for answer in answers])
-        plain, drawn = counted[:, 0].astype(np.float64), counted[:, 1:].mean(axis=0)
-        both = enumerate(("accuracy", "balanced_accuracy"))
-        scores = {score: bootstrap.estimate(plain[:, at], drawn[:, at]) for at, score in both}
-        precisions = [mean_precision(truth, answer) for answer in answers]
-        scores["average_precision"] = bootstrap.constant(precisions, resample_count)
-        return bootstrap.ScoredRow(name, name in {*controls, "majority"}, len(answers), scores)
+        row = bootstrap.scored_row(name, name in {*controls, "majority"}, both, counted)
+        precision = bootstrap.constant([mean_precision(truth, answer) for answer in answers], resample_count)
+        return replace(row, scores={**row.scores, "average_precision": precision})
 
     again: dict[str, Any] = {"settings": settings, "memory": memory}
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
