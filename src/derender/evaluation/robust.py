@@ -184,31 +184,28 @@ class RobustnessComparison:
 
     def tables(self, score: str = "accuracy") -> list[ScoreTable]:
         """For every axis the areas, the curve in numbers, and the verdicts against the controls."""
-        tables = []
+        tables, task = [], f"{len(self.names)} classes"
+        if self.kind != "classes":
+            task = self.names[0] if len(self.names) == 1 else f"{len(self.names)} yes/no labels"
+        dropped = f"; {self.n_dropped:,} images without label left out" if self.n_dropped else ""
         for curve in self.curves:
             rows, last = curve.rows[score], curve.levels[-1]
+            caption = (
+                f"{curve.title}, {curve.levels[0]:.0f} to {last:.0f} degrees: {SCORES[score]} of {task}, "
+                f"{self.how}; {self.head} probes on {self.n_learned[curve.name]:,} images, "
+                f"{curve.n_tested[0]:,} to {max(curve.n_tested):,} tested, {len(self.seeds)} seeds{dropped}"
+            )
             at_last = Column(f"at {last:.0f} deg", "high", note="the curve's last point")
             more = {at_last: lambda row, last=last: row.scores[level_name(last)].value}
             more |= {_LOST: lambda row: row.scores[ORDINARY].value - row.scores[AREA].value}
             angles = [Column(f"{level:.0f}", "high") for level in curve.levels]
             points = [Row(row.name, curve.values(row), row.control) for row in rows]
-            caption, asked = self._caption(curve, score), f"{curve.title}: above the strongest control?"
+            asked = f"{curve.title}: above the strongest control?"
             columns = {AREA: _AREA, ORDINARY: _ORDINARY}
             areas, judged = judged_tables(caption, "features", rows, columns, asked, more=more)
             levels = ScoreTable(f"{curve.title} in degrees: {SCORES[score]}", "features", angles, points)
             tables += [areas, levels, judged]
         return tables
-
-    def _caption(self, curve: CurveResult, score: str) -> str:
-        task = f"{len(self.names)} classes"
-        if self.kind != "classes":
-            task = self.names[0] if len(self.names) == 1 else f"{len(self.names)} yes/no labels"
-        caption = (
-            f"{curve.title}, {curve.levels[0]:.0f} to {curve.levels[-1]:.0f} degrees: {SCORES[score]} of "
-            f"{task}, {self.how}; {self.head} probes on {self.n_learned[curve.name]:,} images, "
-            f"{curve.n_tested[0]:,} to {max(curve.n_tested):,} tested, {len(self.seeds)} seeds"
-        )
-        return caption + (f"; {self.n_dropped:,} images without label left out" if self.n_dropped else "")
 
 
 def level_name(level: float) -> str:

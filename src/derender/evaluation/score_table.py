@@ -24,7 +24,6 @@ class Interval(NamedTuple):
 
 Cell = float | int | str | Interval | None
 ARROWS = {"high": " ↑", "low": " ↓", None: ""}
-LATEX_ARROWS = {"high": r" $\uparrow$", "low": r" $\downarrow$", None: ""}
 
 
 @dataclass(frozen=True)
@@ -154,9 +153,8 @@ class ScoreTable:
 
     def to_markdown(self) -> str:
         """The caption, a table with the best of each column bold and controls in italics, and the notes."""
-        heads = [self.first, *(column.head for column in self.columns)]
-        lines = [map(_markdown, heads), [":---", *("---:" for _ in self.columns)]]
-        lines += self._marked(_markdown, "*{}*", "**{}**")
+        head, *rows = self._marked(_markdown, "*{}*", "**{}**")
+        lines = [head, [":---", *("---:" for _ in self.columns)], *rows]
         notes = "; ".join(f"{column.name}: {column.note}" for column in self.columns if column.note)
         table = ["| " + " | ".join(cells) + " |" for cells in lines]
         return "\n".join([self.caption, "", *table, *(["", notes] if notes else []), ""])
@@ -165,8 +163,7 @@ class ScoreTable:
 
     def to_latex(self) -> str:
         """A table environment; it needs ``\\usepackage{booktabs}``."""
-        heads = [_latex(column.name) + LATEX_ARROWS[column.best] for column in self.columns]
-        lines = [[_latex(self.first), *heads], *self._marked(_latex, r"\textit{{{}}}", r"\textbf{{{}}}")]
+        lines = self._marked(_latex, r"\textit{{{}}}", r"\textbf{{{}}}")
         head, *rows = (" & ".join(cells) + r" \\" for cells in lines)
         begin = [r"\begin{table}", r"\centering", rf"\caption{{{_latex(self.caption)}}}"]
         begin += [rf"\begin{{tabular}}{{l{'r' * len(self.columns)}}}", r"\toprule", head, r"\midrule"]
@@ -174,8 +171,8 @@ class ScoreTable:
         return "\n".join([*begin, *rows, *end])
 
     def _marked(self, escape: Callable[[str], str], control: str, best: str) -> list[list[str]]:
-        """Escaped names and cells, those of controls and the best of each column in their marks."""
-        lines = []
+        """Escaped heads, then names and cells; controls and the best of each column in their marks."""
+        lines = [[escape(self.first), *(escape(column.head) for column in self.columns)]]
         for row in self.rows:
             name = (control if row.control else "{}").format(escape(row.name))
             cells = [(best if marked else "{}").format(escape(text)) for text, marked in self.texts(row)]
@@ -313,5 +310,5 @@ def _latex(text: str) -> str:
 _LATEX = str.maketrans(
     {letter: rf"\{letter}" for letter in "{}$&#%_"}
     | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}"}
-    | {"±": r"$\pm$", "≥": r"$\geq$"}
+    | {"±": r"$\pm$", "≥": r"$\geq$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
 )
