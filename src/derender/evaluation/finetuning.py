@@ -13,6 +13,7 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -274,15 +275,12 @@ def score_finetuned(
     runs |= {row.name: row.arrays() for row in control_rows(shown, start.settings, options, fit_on=fitted)}
     asked = target.asked.select(learned_and_tested)
     rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
-    how: dict[str, Any] = {"resample_count": resample_count, "memory": kept}
+    same = {"task": asked, "rows": rows, "seeds": (seed,), "resample_count": resample_count, "memory": kept}
+    compared = partial(compare_linear, **same)
     tuned_answers = {"fine-tuned": {count: answers[None]}}
-    logistic, joint = compare_linear(
-        runs, asked, rows, (seed,), heads=("logistic",), finetuned=tuned_answers, progress=progress, **how
-    ).parts
-    frozen_alone = {"frozen": runs["frozen"]}
-    (paper,) = compare_linear(frozen_alone, asked, rows, (seed,), heads=("linear",), **how).parts
-    ours, majority = joint.rows
-    frozen, *controls = logistic.rows[:-1]
+    logistic, joint = compared(runs, heads=("logistic",), finetuned=tuned_answers, progress=progress).parts
+    (paper,) = compared({"frozen": runs["frozen"]}, heads=("linear",)).parts
+    (ours, majority), (frozen, *controls, _) = joint.rows, logistic.rows
     beside = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
     beside |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
     others = [ScoredRow(name, True, 1, row.scores) for name, row in beside.items()]
