@@ -120,8 +120,7 @@ def chance_scores(
     deals = [cluster_scores(labels, np.random.default_rng(seed).permutation(sizes)) for seed in seeds]
     if not deals:
         raise ValueError("the chance level needs at least one seed")
-    mean = np.array([list(deal.values()) for deal in deals]).mean(axis=0)
-    return dict(zip(METRICS, mean.tolist(), strict=True))
+    return {name: float(np.mean([deal[name] for deal in deals])) for name in METRICS}
 
 
 def encoded(labels: np.ndarray) -> np.ndarray:

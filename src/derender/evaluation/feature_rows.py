@@ -91,9 +91,7 @@ def row_of(name: str, runs: FeatureSource | Sequence[FeatureSource], options: Op
         else:
             model = opened(run, options.device)
             tables.append(embedded_table(model, options.at(model.image_size), options, f"embedding {name}"))
-    chosen = options.chosen
-    if chosen is not None and not set(chosen) & set(tables[0].factors):
-        chosen = None
+    chosen = options.chosen if set(options.chosen or ()) & set(tables[0].factors) else None
     return FeatureRow(name, tuple(tables), chosen, "control" in tables[0].origin)
 
 

@@ -10,11 +10,11 @@ import hashlib
 import json
 import struct
 import warnings
-import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+from zipfile import BadZipFile
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
@@ -27,8 +27,7 @@ Arrays = dict[str, np.ndarray]
 NAMES = "names of all arrays"
 """Stands beside the arrays in a file: one that a damaged directory of the zip hides is missed."""
 
-_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, struct.error)
-_DAMAGED = (OSError, ValueError, EOFError, LookupError, RuntimeError, *_BROKEN_ZIP)
+_DAMAGED = (OSError, ValueError, EOFError, LookupError, RuntimeError, BadZipFile, zlib.error, struct.error)
 
 
 class Memory:
