@@ -12,26 +12,26 @@ import pytest
 from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 
 BUDGET = {  # lines, files
-    "data": (6_850, 30),
-    "evaluation": (7_180, 32),  # ridge regression in closed form
-    "report": (3_930, 23),  # images that do not suit a model are left out
-    "cli": (2_230, 31),  # the same
-    "training": (3_570, 19),  # CUDA graphs; networks compiled if asked; the framing network
-    "baselines": (2_390, 11),
+    "data": (6_790, 30),
+    "evaluation": (7_160, 32),  # ridge regression in closed form
+    "report": (3_895, 23),  # images that do not suit a model are left out
+    "cli": (2_225, 31),  # the same
+    "training": (3_555, 19),  # CUDA graphs; networks compiled if asked; the framing network
+    "baselines": (2_385, 11),
     "render": (1_695, 15),  # unwarp
-    "features": (1_310, 8),  # a folder is refused before images are embedded
-    "interpretation": (1_085, 5),  # maps of features of the canonical view, in crops
-    "photo": (1_695, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
+    "features": (1_300, 8),  # a folder is refused before images are embedded
+    "interpretation": (1_075, 5),  # maps of features of the canonical view, in crops
+    "photo": (1_690, 8),  # how far faces are turned; why a photograph does not suit a model; its scene
     "networks": (705, 5),
-    "storage": (940, 7),  # links are followed, errors name what was asked for
+    "storage": (935, 7),  # links are followed, errors name what was asked for
     "objectives": (640, 5),
-    "postprocess": (980, 5),  # features of the canonical view; images framed as training images are
-    "scene": (880, 11),  # crops of crops
+    "postprocess": (975, 5),  # features of the canonical view; images framed as training images are
+    "scene": (875, 11),  # crops of crops
     "demo": (485, 3),  # the light of the last portrait
     "renderers": (655, 8),
-    "learn": (920, 5),
+    "learn": (915, 5),
 }
-TOTAL = (38_760, 239)  # on the way to (37_000, 270)
+TOTAL = (38_625, 239)  # on the way to (37_000, 270)
 TEST_LINES = 25_982
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

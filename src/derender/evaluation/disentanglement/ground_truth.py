@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import entr
 
 from derender.evaluation.disentanglement.similarity import held_out, side_by_side
 from derender.features import missing
@@ -193,10 +194,9 @@ def dci(weights: np.ndarray) -> tuple[float, float]:
     """
     scores = []
     for each in (weights, weights.T):
-        total = each.sum(axis=1, keepdims=True)
-        share = each / np.where(total > 0, total, 1)
-        entropy = -(share * np.log(np.where(share > 0, share, 1))).sum(axis=1) / np.log(each.shape[1])
-        scores.append(float(((1 - entropy) * total[:, 0]).sum() / (total.sum() or 1)))
+        total = each.sum(axis=1)
+        entropy = entr(each / np.where(total > 0, total, 1)[:, None]).sum(axis=1) / np.log(each.shape[1])
+        scores.append(float((1 - entropy) @ total / (total.sum() or 1)))
     return scores[0], scores[1]
 
 
@@ -204,9 +204,8 @@ def mutual_information(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Mutual information in nats between each column of (N, D) integers and (N,) integers: (D,)."""
     table = np.zeros((a.shape[1], int(a.max()) + 1, int(b.max()) + 1))
     np.add.at(table, (np.arange(a.shape[1]), a, b[:, None]), 1 / len(b))
-    product = table.sum(axis=2, keepdims=True) * table.sum(axis=1, keepdims=True)
-    ratio = np.divide(table, product, out=np.ones_like(table), where=table > 0)
-    return (table * np.log(ratio)).sum(axis=(1, 2))
+    sides = entr(table.sum(axis=2)).sum(axis=1) + entr(table.sum(axis=1)).sum(axis=1)
+    return sides - entr(table).sum(axis=(1, 2))
 
 
 def binned(values: np.ndarray) -> np.ndarray:
