@@ -14,7 +14,7 @@ from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 BUDGET = {  # lines, files
     "data": (6_790, 30),
     "evaluation": (7_160, 32),  # ridge regression in closed form
-    "report": (3_895, 23),  # images that do not suit a model are left out
+    "report": (3_900, 23),  # images that do not suit a model are left out
     "cli": (2_225, 31),  # the same
     "training": (3_555, 19),  # CUDA graphs; networks compiled if asked; the framing network
     "baselines": (2_385, 11),
@@ -31,8 +31,8 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (915, 5),
 }
-TOTAL = (38_625, 239)  # on the way to (37_000, 270)
-TEST_LINES = 25_982
+TOTAL = (38_626, 239)  # on the way to (37_000, 270)
+TEST_LINES = 25_981
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

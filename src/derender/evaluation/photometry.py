@@ -217,6 +217,7 @@ def relight(
     apart: dict[str, dict[str, list[np.ndarray]]] = {"PSNR": {}, "SSIM": {}}
     progress = how.stage("relighting", "people")
     for number, person in enumerate(people):
+        progress(number + 1, len(people))
         others, own = people[number + 1 :] + people[:number], np.flatnonzero(who == person)
         source = int(own[np.argmin(off[own])])
         others = [one for one in others if (one, lit[source]) in place]  # the first of them lends the light
@@ -245,16 +246,15 @@ def relight(
             scores = reconstruction_scores(shown, photos[targets], covered)
             apart["PSNR"].setdefault(name, []).append(scores.psnr_db_each)
             apart["SSIM"].setdefault(name, []).append(scores.ssim_each)
-        progress(number + 1, len(people))
     if not rows:
         raise ValueError("no two people have images in the same two lights: nothing to compare")
     tables, notes = [], list(how.notes)
-    values: dict[str, Any] = {"pictures": len(rows), "people": len(people)}
+    values: dict[str, Any] = {"pictures": len(rows), "people": len(set(who[rows]))}
     weights = how.drawn(who[rows])
     for title, unit, digits in (("PSNR", "dB", 1), ("SSIM", "at most 1", 3)):
         each = {name: np.concatenate(parts) for name, parts in apart[title].items()}
         scored, columns, _ = binned_rows(each, off[rows], weights, CONTROLS, digits=digits)
-        caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {len(people)} people, by light"
+        caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {values['people']} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
         values[title.lower()] = numbers_of(scored)
         notes.append(f"{title}, {verdict(scored[0], 'all', columns['all'])}")

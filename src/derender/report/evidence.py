@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from derender.baselines import read_any_config
 from derender.data import GroundTruth, ImageSet, Progress, as_float, read_ground_truth, split_indices
 from derender.data.doctor import EXAMINED_PX, doctor
+from derender.data.source import evenly_spaced
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.pixels import evaluate_reconstruction, mean_image
 from derender.evaluation.truth import evaluate_factors, evaluate_geometry
@@ -222,4 +223,4 @@ def suitable_label(images: ImageSet) -> tuple[str, ...]:
 
 def _sample(images: ImageSet, most: int) -> ImageSet:
     """At most so many images, evenly through the set."""
-    return images.select(np.linspace(0, len(images) - 1, min(most, len(images))).round().astype(int))
+    return images.select(evenly_spaced(len(images), most))
