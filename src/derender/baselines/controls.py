@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from sklearn.decomposition import PCA
 
 from derender.data import ImageSet
 from derender.features import FeatureTable, Progress, table_labels
@@ -73,6 +72,8 @@ def pca_features(
 
     ``fit_on`` gives the components; by default ``images`` themselves. ``seed`` is of the randomised solver.
     """
+    from sklearn.decomposition import PCA
+
     source = (images if fit_on is None else fit_on).require(2, "PCA")
     limit = min(len(source), source.images[0].size)
     if not 1 <= components <= limit:

@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from sklearn.cluster import KMeans, MiniBatchKMeans
 
 from derender.evaluation import neighbours
 from derender.evaluation.memory import Memory
@@ -227,6 +226,8 @@ def clusterings(
         return {count: cut(tree, count) for count in wanted}
 
     def k_means(count: int) -> np.ndarray:
+        from sklearn.cluster import KMeans, MiniBatchKMeans
+
         how: dict[str, Any] = {"n_clusters": count, "n_init": 10, "random_state": seed}
         many = len(features) > neighbours.EXACT_ROWS
         means = MiniBatchKMeans(batch_size=_MINI_BATCH, **how) if many else KMeans(**how)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sklearn.metrics import average_precision_score
 
 from derender.data import split_indices
 from derender.features import missing
@@ -163,6 +162,8 @@ def linear_scores(targets: np.ndarray, probabilities: np.ndarray, kind: str) -> 
 
 def mean_precision(targets: np.ndarray, probabilities: np.ndarray) -> float:
     """Average precision of ``linear_scores``, 0 to 1, best 1; NaN where no row is positive."""
+    from sklearn.metrics import average_precision_score
+
     columns = [(t, t >= 0, p) for t, p in zip(targets.T, probabilities.T, strict=True) if (t == 1).any()]
     precisions = [average_precision_score(truth[known], answer[known]) for truth, known, answer in columns]
     return float(np.mean(precisions)) if precisions else float("nan")

@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from sklearn.decomposition import PCA
 from torch import Tensor
 
 from derender.baselines.controls import flat_pixels
@@ -96,15 +95,10 @@ def mean_image(images: np.ndarray) -> Float[Tensor, "3 h w"]:
 
 
 def evaluate_reconstruction(
-    model: Any,
-    images: np.ndarray,
-    *,
-    mean: Float[Tensor, "3 h w"] | None = None,
-    components_of: np.ndarray | None = None,
-    untrained: Any = None,
-    batch_size: int = 64,
+    model: Any, images: np.ndarray, *, mean: Float[Tensor, "3 h w"] | None = None,
+    components_of: np.ndarray | None = None, untrained: Any = None, batch_size: int = 64,
     progress: Progress | None = None,
-) -> ReconstructionResult:
+) -> ReconstructionResult:  # fmt: skip
     """Score a model with ``reconstruct`` and ``device`` on uint8 images (N, 3, H, W) it has not seen.
 
     The mean image is best that of the training images, by default of ``images``. ``components_of`` are images
@@ -138,6 +132,8 @@ def component_count(images: int) -> int:
 
 def from_components(images: np.ndarray, fitted: np.ndarray) -> Float[Tensor, "n 3 h w"]:
     """uint8 images (N, 3, H, W) from the principal components of (M, 3, H, W) others alone, in 0..1."""
+    from sklearn.decomposition import PCA
+
     with np.errstate(invalid="ignore"):  # a single image has no variance
         pca = PCA(component_count(len(fitted)), random_state=0).fit(flat_pixels(fitted))
     again = pca.inverse_transform(pca.transform(flat_pixels(images))).astype(np.float32)

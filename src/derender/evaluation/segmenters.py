@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64, UInt8
 from pydantic import Field
-from sklearn.decomposition import PCA
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
@@ -300,6 +299,8 @@ def by_components(data: SegmentationData) -> np.ndarray:
     64 components (a quarter of the training images, where that is fewer) of at most 2,000 training images.
     Scaling them would change nothing. Of two even classes the lower.
     """
+
+    from sklearn.decomposition import PCA
 
     def described(rows: np.ndarray) -> np.ndarray:
         parts = np.array_split(rows, max(1, len(rows) // _CHUNK))
