@@ -210,9 +210,8 @@ def test_the_readme_is_short_and_its_python_runs(capsys, tmp_path, monkeypatch):
     names = {"__name__": "readme"}
     monkeypatch.chdir(tmp_path)
     exec(compile(block.replace("generate(1, 512", "generate(1, 160"), "README.md", "exec"), names)
-    assert len(names["features"]) == 4 and all(
-        (tmp_path / name).exists() for name in ("relit.png", "turned.png")
-    )
+    assert len(names["features"]) == 4
+    assert all((tmp_path / name).exists() for name in ("relit.png", "turned.png"))
 
 
 @pytest.mark.parametrize("path", [one for one in PAGES if "tutorials" not in one.parts], ids=named)

@@ -86,9 +86,8 @@ def test_a_command_is_a_short_file():
 
 
 def test_no_two_classes_share_a_name():
-    names = Counter(
-        node.name for path in SOURCES for node in ast.walk(syntax(path)) if isinstance(node, ast.ClassDef)
-    )
+    nodes = (node for path in SOURCES for node in ast.walk(syntax(path)))
+    names = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
     assert not (twice := [name for name, count in names.items() if count > 1]), twice
 
 

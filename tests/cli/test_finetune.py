@@ -77,10 +77,8 @@ def test_bad_words_are_one_line(trained, faces, tmp_path, refused):
     assert "give either labels or attributes" in refused(*tune, "-l", "expression", "--attributes")
     assert "no yes/no label" in refused(*tune, "--attributes", "--preset", "small", *settings(*TINY))
     assert "give one of them" in refused(*tune, "-m", trained, "--preset", "small", "-l", "expression")
-    assert "no label 'expresion'; did you mean 'expression'" in refused(
-        *tune, "-m", trained, "-l", "expresion"
-    )
     from_run = (*tune, "-m", trained, "-l", "expression")
+    assert "no label 'expresion'; did you mean 'expression'" in refused(*from_run[:-1], "expresion")
     assert "leave out settings of model.network" in refused(*from_run, *settings("model.network.width=8"))
     assert "target.weight" in refused(*from_run, "--weight", "-1")
     assert "no run to resume" in refused(*tune, "--resume")

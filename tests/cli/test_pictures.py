@@ -282,9 +282,8 @@ def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
     assert "holds no images" in refused("rotate", "-m", tiny, tmp_path, "-o", out)
     assert "reach must lie between" in refused("rotate", *given, "--reach", "120")
     assert "reach must not be 0" in refused("relight", *given, "--reach", "0")
-    assert "size 16 is below the model's: give --size 32 or more" in refused(
-        "relight", *given, "--size", "16"
-    )
+    small = refused("relight", *given, "--size", "16")
+    assert "size 16 is below the model's: give --size 32 or more" in small
     assert "unknown detail 'foto'; did you mean 'photo'" in refused("mesh", *given, "--detail", "foto")
     assert "unknown format 'gbl'; did you mean 'glb'" in refused("mesh", *given, "--format", "gbl")
     assert "unknown kind of film 'avi'" in refused("rotate", *given, "--film", "avi")

@@ -120,9 +120,8 @@ def striped(width: int, height: int) -> Image.Image:
 
 @pytest.mark.parametrize("size", [(36, 12), (12, 36), (90, 30)])
 def test_crop_keeps_the_centre_and_pad_and_stretch_all_of_it(encoded, size):
-    cropped, padded, stretched = (
-        read_image(encoded(striped(*size)), 12, fit=fit) for fit in ("crop", "pad", "stretch")
-    )
+    fits, file = ("crop", "pad", "stretch"), encoded(striped(*size))
+    cropped, padded, stretched = (read_image(file, 12, fit=fit) for fit in fits)
     assert (cropped == np.array([0, 255, 0])[:, None, None]).mean() > 0.99
     if size[0] < size[1]:
         padded, stretched = padded.transpose(0, 2, 1), stretched.transpose(0, 2, 1)

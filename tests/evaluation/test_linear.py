@@ -223,9 +223,8 @@ def test_scores_of_classes_are_scikit_learns():
     targets, answers = (classes[:, None] == np.arange(5)).astype(np.int8), rng.random((44, 5))
     result = linear_scores(targets, answers, "classes")
     assert result.accuracy == pytest.approx(accuracy_score(classes, answers.argmax(axis=1)))
-    assert result.balanced_accuracy == pytest.approx(
-        recall_score(classes, answers.argmax(axis=1), labels=range(4), average="macro")
-    )
+    recall = recall_score(classes, answers.argmax(axis=1), labels=range(4), average="macro")
+    assert result.balanced_accuracy == pytest.approx(recall)
     precisions = [average_precision_score(targets[:, one], answers[:, one]) for one in range(4)]
     assert result.average_precision == pytest.approx(np.mean(precisions))
 

@@ -38,9 +38,8 @@ def test_locations_of_all_images_count_by_the_share_of_their_pixels_that_the_mas
     for given, each in ((None, errors.square()), (sigma[:, None, None], scaled)):
         expected = float((share * each).sum() / 2.5)
         for kept in (mask, mask.bool()):
-            assert perceptual_loss(prediction, target, kept, given).item() == pytest.approx(
-                expected, rel=1e-4
-            )
+            result = perceptual_loss(prediction, target, kept, given).item()
+            assert result == pytest.approx(expected, rel=1e-4)
 
 
 def test_sigma_of_another_resolution_is_refused(generator):

@@ -6,6 +6,7 @@ import re
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,22 +35,17 @@ def free_port() -> str:
 
 
 def two_processes(*arguments: str) -> list[tuple[int, str]]:
-    """Run python with these arguments twice, as torchrun would; exit codes and what was printed."""
+    """Run one_rank.py with these arguments as torchrun would, twice; exit codes and what was printed."""
     common = {
-        **os.environ, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "GROUP_RANK": "0",
-        "TORCHELASTIC_RUN_ID": "test",
-        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "GLOO_SOCKET_IFNAME": "lo",
+        **os.environ, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "test",
+        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "GLOO_SOCKET_IFNAME": "lo", "GROUP_RANK": "0",
         "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
     }  # fmt: skip
-    own = [common | {"RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    running = [subprocess.Popen([sys.executable, *arguments], env=one, **pipes) for one in own]
-    try:
-        printed = [process.communicate(timeout=120)[0] for process in running]
-    finally:
-        for process in running:
-            process.kill()
-    return [(process.returncode, words) for process, words in zip(running, printed, strict=True)]
+    with tempfile.TemporaryDirectory() as place:
+        words = [sys.executable, str(Path(__file__).with_name("one_rank.py")), place, *arguments]
+        ended = subprocess.run(words, env=common, capture_output=True, text=True, timeout=120)
+        codes = map(int, ended.stdout.split())
+        return [(code, (Path(place) / rank).read_text()) for rank, code in zip("01", codes, strict=True)]
 
 
 @pytest.fixture
@@ -82,8 +78,7 @@ def told(folder, tmp_path_factory) -> tuple[dict, list[list[str]], Path]:
         [*train_words, "--out", str(place / "refused"), *settings("batch_size=7")],
         [*train_words, "--out", str(place / "run"), *settings("images=32")],
     ]
-    script = str(Path(__file__).with_name("one_rank.py"))
-    ended = two_processes(script, str(place / "found.json"), json.dumps(commands), free_port())
+    ended = two_processes(str(place / "found.json"), json.dumps(commands), free_port())
     assert [code for code, _ in ended] == [0, 0], ended
     printed = [re.split(r"(?<=\nended with \d)\n", words)[:2] for _, words in ended]
     return json.loads((place / "found.json").read_text()), printed, place

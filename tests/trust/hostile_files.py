@@ -154,9 +154,8 @@ def write_hostile_zip(file: Path) -> Path:
             archive.writestr(name, encoded(smooth(80)))
         archive.writestr(link, "/etc/passwd")
     content = bytearray(file.read_bytes())
-    encrypted, huge = (
-        content.rfind(b"PK\x01\x02", 0, content.rfind(name)) for name in (b"encrypted.png", b"huge.png")
-    )
+    ends = map(content.rfind, (b"encrypted.png", b"huge.png"))
+    encrypted, huge = (content.rfind(b"PK\x01\x02", 0, end) for end in ends)
     content[encrypted + 8] |= 1
     content[huge + 24 : huge + 28] = struct.pack("<I", (1 << 32) - 2)
     file.write_bytes(content)

@@ -92,9 +92,8 @@ def test_few_labels_show_one_head_and_the_tables_of_all(whole):
 def test_the_same_command_again_does_nothing_twice(plan, whole, capsys):
     before, weights = scores(whole), whole / "runs" / "colours" / "ae" / "model" / "model.safetensors"
     at = weights.stat().st_mtime_ns
-    assert (
-        main(["compare", "--plan", str(plan), "--out", str(whole), "--workers", "2", "--minutes", "9"]) == 0
-    )
+    words = ["compare", "--plan", str(plan), "--out", str(whole), "--workers", "2", "--minutes", "9"]
+    assert main(words) == 0
     printed = capsys.readouterr().err
     assert "embed gone of people: failed" in printed  # tried again: it may have come
     assert "train ae" not in printed and "score people" not in printed

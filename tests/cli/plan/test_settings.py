@@ -54,9 +54,8 @@ def test_jobs_share_trainings_and_come_after_what_they_need(read):
         for method in ("ours", "small vqvae")
         for seed in ("", ", seed 1")
     ]
-    wanted = [
-        f"embed {name} of lfw{seed}" for name in ("ours", "codes", "small vqvae") for seed in ("", ", seed 1")
-    ]
+    made = ("ours", "codes", "small vqvae")
+    wanted = [f"embed {name} of lfw{seed}" for name in made for seed in ("", ", seed 1")]
     assert [job for job in jobs if "of lfw" in job] == [*wanted, "embed hog of lfw"]
     for where, scored in (("faces", "lfw"), ("cars", "police")):
         end = jobs.index(f"score {scored}")

@@ -78,9 +78,8 @@ def test_a_length_beside_chunks_is_refused_and_nothing_behind_it_is_served(clien
         other = head(client.url, "/api/view", "Content-Length: 2\r\n") + b"{}"
         connection.sendall(one + b"0\r\n\r\n" + other)
         result = answered(connection)
-    assert (
-        result.count(b"HTTP/1.1 ") == 1 and b" 400 " in result and b"Transfer-Encoding is refused" in result
-    )
+    assert result.count(b"HTTP/1.1 ") == 1 and b" 400 " in result
+    assert b"Transfer-Encoding is refused" in result
 
 
 @pytest.mark.parametrize(
