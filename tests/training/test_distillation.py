@@ -54,13 +54,14 @@ def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
 def test_the_same_seed_distils_the_same_and_nothing_else_is_touched(model, images):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.random.get_rng_state()
-    one, again = (distillation.refine(model, images, images, changed(images=16), seed=5) for _ in range(2))
+    few = images[:8]
+    one, again = (distillation.refine(model, few, few, changed(images=16), seed=5) for _ in range(2))
     assert torch.equal(torch.random.get_rng_state(), state)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert again.errors == one.errors and again.gaps == one.gaps
     ours = one.model.state_dict()
     assert all(torch.equal(value, ours[name]) for name, value in again.model.state_dict().items())
-    other = distillation.refine(model, images, images, changed(images=16), seed=6).model.state_dict()
+    other = distillation.refine(model, few, few, changed(images=16), seed=6).model.state_dict()
     assert any(not torch.equal(value, ours[name]) for name, value in other.items())
 
 

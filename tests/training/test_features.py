@@ -75,7 +75,10 @@ def test_a_last_batch_of_one_image_is_left_out_of_exchanges(plain, images):
 
 
 @pytest.mark.parametrize("mirrored", [True, False])
-def test_a_mirror_image_has_the_features_of_the_image_where_both_are_read(plain, images, tmp_path, mirrored):
+def test_a_mirror_image_has_the_features_of_the_image_where_both_are_read(
+    plain, images, monkeypatch, tmp_path, mirrored
+):
+    monkeypatch.setattr("derender.networks.encoders.MAX_PLACES", 512)
     changes = {"mirrored": mirrored, "pictures": 16, "spatial": mirrored, "vectors": False}
     model = whitened(plain, images, SETTINGS.model_copy(update=changes))
     again = derender.load(model.save(tmp_path / "model"))
@@ -187,7 +190,8 @@ def test_the_canonical_view_of_turned_heads_differs_less_than_they_do(plain, ima
     assert left < 0.6 * apart
 
 
-def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tmp_path):
+def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tmp_path, monkeypatch):
+    monkeypatch.setattr("derender.networks.encoders.MAX_PLACES", 512)  # whitening takes their cube
     settings = WhiteningSettings(pictures=12, views=2, directions=8, photographs=True, canonical=True)
     model, pixels = whitened(plain, images[:12], settings), images[:6].float() / 255
     turned = plain.factor_activations("geometry", plain.canonical_view(pixels))
@@ -210,6 +214,7 @@ def test_geometry_of_the_canonical_view_is_kept_with_the_model(plain, images, tm
 
 
 def test_features_of_framed_images_are_kept_with_the_model(plain, images, tmp_path, monkeypatch):
+    monkeypatch.setattr("derender.networks.encoders.MAX_PLACES", 512)
     monkeypatch.setattr("derender.training.framing.BATCH", 16)
     monkeypatch.setattr("derender.postprocess.framing.DOUBT", 0.0)  # every image is moved
     settings = WhiteningSettings(pictures=12, views=2, directions=8, photographs=True, canonical=True)

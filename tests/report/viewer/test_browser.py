@@ -36,8 +36,8 @@ def rendered() -> np.ndarray:
 @pytest.fixture(scope="module")
 def address(rendered) -> Iterator[str]:
     model = load("rendered-faces-64")
-    model = model.with_features(model.features.with_steps(8))
-    made = {"fit_steps": 8}
+    model = model.with_features(model.features.with_steps(2))
+    made = {"fit_steps": 2}
     table = FeatureTable(("a<b>.png", "b.png", "c.png"), embed_images(model, rendered), {}, made)
     examples = [Example(f"<i>face</i> {at}", one.transpose(1, 2, 0)) for at, one in enumerate(rendered)]
     studio = Studio(model, "rendered-faces-64", Shelf(3), examples, Gallery(table))
