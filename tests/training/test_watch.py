@@ -136,13 +136,13 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypa
         for sign in SIGNS
     ]
     monkeypatch.setattr(watching, "SIGNS", tuple(signs))
-    result = train(resolve("small", COLLAPSING), generated(200), tmp_path / "run")
+    result = train(resolve("small", COLLAPSING), generated(60), tmp_path / "run")
     assert result.stopped == "collapse" and result.images < 4_000
     results = {finding.sign for finding in result.findings if finding.fatal}
     assert results & {"saturated depth", "torn depth", "view at its bound"}
     rows = read_metrics(tmp_path / "run")
     errors = [row["l1"] for row in rows if row["kind"] == "train"]
-    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.56 with torch 2.15
+    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.44 with torch 2.15
     assert results <= set(rows[-1])
 
 
