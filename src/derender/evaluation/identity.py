@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import sem
 
 from derender.data.layouts.layout import in_test_half, stem_of
 from derender.evaluation import bootstrap
@@ -235,7 +234,7 @@ def verify(
         both = np.stack((accuracy, areas), axis=2)
         scored.append(bootstrap.scored_row(row.name, row.control, columns, both))
         each = [right[:, pairs.fold == fold].mean() for fold in np.unique(pairs.fold)]
-        errors[row.name] = float(sem(each))
+        errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
     half_right = bootstrap.constant(0.5, how.resamples)
     scored.append(bootstrap.ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
     scored = bootstrap.with_verdicts(scored)

@@ -59,6 +59,12 @@ def read_json(file: Path, kind: Any, otherwise: str = "copy or train the model a
         raise ValueError(f"{file} {why}: {otherwise}") from error
 
 
+def table_beside(module: str, name: str) -> Any:
+    """The plain values of a YAML file of this package, which lies beside a module's ``__file__``."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where it is built
+    return loader(Path(module).with_name(name).read_text(encoding="utf-8")).get_single_data()
+
+
 def parse_json(content: str | bytes, kind: Any) -> Any:
     """JSON text as a value of ``kind``; a ValueError where it is none, or nested deeper than about 200."""
     return TypeAdapter(kind).validate_json(content, strict=True)

@@ -7,7 +7,6 @@ Source: the paper, Sec. 4 and its published settings. Where the two differ the s
 import json
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 import yaml
@@ -23,6 +22,7 @@ from derender.presets import MODEL_PRESETS, ModelSettings, named_preset
 from derender.renderers import renderer_named
 from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
+from derender.storage.bounded import table_beside
 
 
 def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
@@ -191,7 +191,7 @@ REMOVED: dict[str, Any] = {
 }  # fmt: skip
 """Settings of earlier versions: runs that have them at this value (...: at any) still load."""
 
-_CHANGES = yaml.safe_load(Path(__file__).with_name("presets.yaml").read_text(encoding="utf-8"))
+_CHANGES = table_beside(__file__, "presets.yaml")
 PRESETS: dict[str, TrainConfig] = {
     name: TrainConfig.model_validate({"preset": name, "model": MODEL_PRESETS[name], **changes})
     for name, changes in _CHANGES.items()

@@ -11,11 +11,9 @@ loss.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -23,6 +21,7 @@ from derender.scene import Scene
 from derender.scene.light import lambert_shading
 from derender.scene.normals import normals_from_depth
 from derender.scene.ranges import SceneRanges
+from derender.storage.bounded import table_beside
 from derender.training.distributed import ALONE, Ranks
 
 USUAL_BATCH = 16
@@ -60,7 +59,7 @@ class Sign:
         return measured > self.limit if self.above else measured < self.limit
 
 
-_TABLE = yaml.safe_load(Path(__file__).with_name("signs.yaml").read_text(encoding="utf-8"))
+_TABLE = table_beside(__file__, "signs.yaml")
 SIGNS = tuple(
     Sign(name, **row | {"advice": row["advice"].format(slower=SLOWER)}) for name, row in _TABLE.items()
 )

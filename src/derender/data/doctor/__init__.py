@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from jaxtyping import Float, Int64
 
 from derender.data.doctor import measures
@@ -20,6 +19,7 @@ from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
 from derender.data.source import evenly_spaced, is_image
 from derender.data.stream import Progress
+from derender.storage.bounded import table_beside
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
@@ -77,8 +77,7 @@ class Check:
     noted: float | None = None
 
 
-_TABLE = Path(__file__).with_name("checks.yaml").read_text(encoding="utf-8")
-CHECKS = {name: Check(**row) for name, row in yaml.safe_load(_TABLE).items()}  # by the names of the measures
+CHECKS = {name: Check(**row) for name, row in table_beside(__file__, "checks.yaml").items()}  # by measure
 
 
 def judged(value: JackknifeEstimate, check: Check) -> tuple[Level, bool]:

@@ -10,14 +10,13 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
 from jaxtyping import Float32
 
 from derender.data.source import Skipped, Source, evenly_spaced, stem_of
+from derender.storage.bounded import table_beside
 from derender.storage.places import require_known
 
 Labels = dict[str, np.ndarray]
@@ -29,7 +28,7 @@ PARTITION_NAMES = {
 }
 """What people call the parts of a split, and what they are called here."""
 
-TOLD = yaml.safe_load(Path(__file__).with_name("layouts.yaml").read_text(encoding="utf-8"))
+TOLD = table_beside(__file__, "layouts.yaml")
 """What is told of each layout, by its name."""
 
 _MOSTLY = 0.9

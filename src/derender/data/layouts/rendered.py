@@ -11,10 +11,8 @@ below a folder 02958343, the number of its cars. Words in that table give the la
 import math
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
-import yaml
 
 from derender.data.image import DECODER_ERRORS, upright_size
 from derender.data.layouts.layout import (
@@ -29,11 +27,12 @@ from derender.data.layouts.layout import (
     text_column,
 )
 from derender.data.source import Source, parent_name, stem_of
+from derender.storage.bounded import table_beside
 
 LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
 
-_NAMES = yaml.safe_load(Path(__file__).with_name("rendered.yaml").read_text(encoding="utf-8"))
+_NAMES = table_beside(__file__, "rendered.yaml")
 _NUMBERS, _DEGREES, _TEXTS, CAR_CLASSES = (
     _NAMES[kind] for kind in ("numbers", "degrees", "texts", "car_classes")
 )

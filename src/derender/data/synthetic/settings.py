@@ -8,17 +8,16 @@ it, so the same seed shows the same people in another light. ``LIGHTS``, ``VIEWS
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-import yaml
 from numpy import ndarray
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from derender.data.synthetic.lighting import TEXELS, Lighting
 from derender.overrides import with_changes
 from derender.settings import Settings
+from derender.storage.bounded import table_beside
 from derender.storage.places import require_known
 
 Kind = TypeVar("Kind", bound=Settings)
@@ -31,7 +30,7 @@ _YAW_SHARE = 0.6
 @lru_cache(maxsize=2)
 def numbers_of(kind: str) -> dict[str, Any]:
     """The tables in ``faces.yaml`` or ``cars.yaml``."""
-    return yaml.safe_load(Path(__file__).with_name(f"{kind}.yaml").read_text(encoding="utf-8"))
+    return table_beside(__file__, f"{kind}.yaml")
 
 
 EXPRESSIONS: dict[str, dict[str, float]] = numbers_of("faces")["expressions"]
