@@ -25,14 +25,14 @@ BUDGET = {  # lines, files
     "networks": (705, 5),
     "storage": (945, 7),  # links are followed, errors name what was asked for, own tables are read by C
     "objectives": (640, 5),
-    "postprocess": (975, 5),  # features of the canonical view; images framed as training images are
+    "postprocess": (976, 5),  # canonical view; framing; products that no number of rows rounds otherwise
     "scene": (875, 11),  # crops of crops
     "demo": (485, 3),  # the light of the last portrait
     "renderers": (655, 8),
     "learn": (915, 5),
 }
-TOTAL = (38_626, 239)  # on the way to (37_000, 270)
-TEST_LINES = 25_981
+TOTAL = (38_631, 239)  # on the way to (37_000, 270)
+TEST_LINES = 25_806
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -48,7 +48,7 @@ def test_renderings_of_one_image_differ_by_one_in_every_kept_direction(codes):
     features = (codes - result.mean) @ result.map
     within = (features - features.mean(dim=0)).flatten(0, 1)
     values = torch.linalg.eigvalsh(within.T @ within / (IMAGES * (VIEWS - 1)))
-    assert values[-5:] == pytest.approx(np.ones(5), abs=2e-3)
+    assert values[-5:] == pytest.approx(np.ones(5), abs=4e-3)
     assert values[:-5].abs().max() < 1e-4
     assert torch.linalg.matrix_rank(result.map, rtol=1e-4) == 5
 

