@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,13 @@ import derender
 from derender.cli import main
 from derender.data import ImageSet
 from derender.storage.atomic import DamageNoticed
-from derender.training import TrainingInterrupted, resolve, train
+from derender.training import TrainingInterrupted, loop, resolve, train, watch
 from derender.training.batches import Batches
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
 from derender.training.loop import kept
 from derender.training.run_folder import read_config, read_metrics
 from derender.training.task import Progress
+from derender.training.watch import SIGNS, Watcher
 
 TINY = ["image_size=32", "width=8", "light_width=4", "perceptual=none", "batch_size=8", "checkpoint_every=32"]
 TINY += ["validate_every=32", "sample_every=64", "deterministic=true", "learning_rate=1e-3"]
@@ -93,20 +95,44 @@ def test_a_mapped_set_is_trained_on_where_it_lies_and_gives_the_same_weights(pic
     assert sizes[0] == 60 > sizes[-1]
 
 
-def test_an_interrupted_run_is_saved_and_resumes_exactly(pictures, tmp_path):
-    def press_ctrl_c(progress: Progress) -> None:
-        if progress.done == 40:
-            os.kill(os.getpid(), signal.SIGINT)
+def ctrl_c_at(images: int, progress: Progress) -> None:
+    if progress.done == images:
+        os.kill(os.getpid(), signal.SIGINT)
 
+
+def test_an_interrupted_run_is_saved_and_resumes_exactly(pictures, tmp_path):
     changing = ["loocc=light+camera", "images=80", "warmup_images=24", "final_rate=0.1"]
     config = resolve("small", [*TINY, *changing])
     with pytest.raises(TrainingInterrupted, match=r"stopped after 40 images and saved.*--resume"):
-        train(config, pictures, tmp_path / "parts", progress=press_ctrl_c)
+        train(config, pictures, tmp_path / "parts", progress=partial(ctrl_c_at, 40))
     assert train(config, pictures, tmp_path / "parts", resume=True).images == 80
     train(config, pictures, tmp_path / "whole")
     images = [row["images"] for row in read_metrics(tmp_path / "parts") if row["kind"] == "validation"]
     assert images[-1] == 80 and {32, 64} <= {*images}
     assert_same_weights(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_hollow_surfaces_are_inverted_where_a_resumed_run_inverts_them_too(pictures, tmp_path, monkeypatch):
+    def until_64(watcher: Watcher, images: int, loss: float, latest: dict[str, float], *broken: str):
+        return judge(watcher, images, loss, {**latest, "bulge": 0.2 if images > 64 else -0.5}, *broken)
+
+    judge, signs = (
+        Watcher.judge,
+        [dataclasses.replace(one, grace_images=0) for one in SIGNS if one.invert is not None],
+    )
+    monkeypatch.setattr(Watcher, "judge", until_64)
+    monkeypatch.setattr(loop, "READ_EVERY_STEPS", 4)
+    for name, value in {"PERSISTENCE_IMAGES": 40, "MEMORY_IMAGES": 8, "SIGNS": signs}.items():
+        monkeypatch.setattr(watch, name, value)
+    config = resolve("small", [*TINY, "images=80"])
+    with pytest.raises(TrainingInterrupted):
+        train(config, pictures, tmp_path / "parts", progress=partial(ctrl_c_at, 56))
+    assert not [row for row in read_metrics(tmp_path / "parts") if row["kind"] == "note"]
+    train(config, pictures, tmp_path / "parts", resume=True)
+    assert train(config, pictures, tmp_path / "whole").stopped == "images"
+    assert_same_weights(tmp_path / "whole", tmp_path / "parts")
+    (note,) = [row for row in read_metrics(tmp_path / "parts") if row["kind"] == "note"]
+    assert note["images"] == 64 and note["text"].startswith("surfaces were hollow")
 
 
 def test_self_trained_perceptual_features_are_kept_for_the_resumed_run(pictures, tmp_path):

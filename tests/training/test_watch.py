@@ -14,6 +14,7 @@ from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.training import resolve, train
 from derender.training import watch as watching
+from derender.training.derender_task import DerenderTask
 from derender.training.run_folder import read_metrics
 from derender.training.watch import SIGNS, Finding, Watcher
 
@@ -82,6 +83,37 @@ def test_each_failure_is_found_within_20000_images_but_not_at_once_and_explained
     result = watch(FAILED_SCENES[sign], 20_000)[sign]
     assert "{" not in result.text and any(character.isdigit() for character in result.text)
     assert len(result.advice) > 20
+
+
+def test_hollow_surfaces_are_inverted_once_and_then_a_failure():
+    hollow, watcher = FAILED_SCENES["hollow depth"], Watcher(RANGES, BATCH)
+    assert watch(hollow, 8_500, watcher) == {} and watcher.inversion == "due"
+    slightly = Watcher(RANGES, BATCH)
+    for images in range(STEP, 9_000, STEP):
+        assert not slightly.judge(images, 0.1, measured(healthy_scene()) | {"bulge": -0.08})
+    assert slightly.inversion == "due"
+    watcher = Watcher.remembering(RANGES, BATCH, {**watcher.memory(), "inversion": "done"})
+    assert watch(healthy_scene(), 30_000, watcher, start=8_500) == {}
+    assert "hollow depth" in watch(hollow, 40_000, watcher, start=30_000)
+
+
+def test_an_inverted_model_shows_almost_the_same_images_of_reliefs_pressed_in():
+    model = derender.load("rendered-faces-64").requires_grad_()
+    images = torch.from_numpy(faces.generate(4, seed=1).images) / 255
+    optimiser, task = torch.optim.Adam(model.parameters(), lr=0), DerenderTask(resolve("small"))
+    model.render(model.decode(model.encode(images))).image.sum().backward()
+    optimiser.step()
+    average = optimiser.state[model.nets["light"].decoder.linear.weight]["exp_avg"]
+    before, scene = average.clone(), model.decompose(images)
+    task.invert(model, optimiser)
+    inverted = model.decompose(images)
+    torch.testing.assert_close(average, before * torch.tensor([1.0, 1, -1, -1])[:, None])
+    assert measured(inverted)["bulge"] == pytest.approx(-measured(scene)["bulge"], abs=0.01)
+    torch.testing.assert_close(inverted.camera[:, :2], -scene.camera[:, :2])
+    apart = (model.render(inverted).image - model.render(scene).image)[..., 16:48, 16:48]
+    assert apart.abs().mean() < 0.05
+    task.invert(model, optimiser)
+    torch.testing.assert_close(model.decompose(images).depth, scene.depth)
 
 
 def test_large_batches_are_given_as_many_updates_not_as_many_images():

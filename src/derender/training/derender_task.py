@@ -33,6 +33,9 @@ from derender.training.step import StepResult, own_share, training_step
 from derender.training.task import Losses, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
 from derender.training.watch import Watcher
 
+INVERTED = {"geometry": (0,), "light": (2, 3), "camera": (0, 1)}
+"""By factor the outputs that change sign where a relief is pressed in instead of out."""
+
 
 def train(
     config: TrainConfig, images: ImageSet, out: str | Path, *, resume: bool = False,
@@ -128,6 +131,20 @@ class DerenderTask(TrainingTask):
     def watch(self, memory: dict[str, Any]) -> Watcher:
         """The collapse detector."""
         return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory, self.ranks)
+
+    @torch.no_grad()
+    def invert(self, model: Derenderer, optimiser: torch.optim.Optimizer) -> None:
+        """Press reliefs in instead of out, or the reverse; camera and light then show almost equal images.
+
+        In the weak perspective of a small field of view both explain an image (the bas-relief ambiguity,
+        Belhumeur et al. 1999). Signs of weights of last layers change, and of their gradients' averages.
+        """
+        for factor, rows in INVERTED.items():
+            for name, weight in model.nets[factor].decoder.named_parameters():
+                for row in rows if name.endswith(("last.weight", "linear.weight")) else ():
+                    weight[row].neg_()
+                    if weight in optimiser.state:
+                        optimiser.state[weight]["exp_avg"][row].neg_()
 
 
 def require_perceptual(objective: ObjectiveSettings) -> None:

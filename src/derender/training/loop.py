@@ -142,7 +142,7 @@ class _Run:
                 self.report(Progress("train", state.images, config.images, speed, terms, waiting))
 
                 span = before, state.images
-                if steps % READ_EVERY_STEPS and not self.due(*span, stop=signals.is_set()):
+                if self.position % READ_EVERY_STEPS and not self.due(*span, stop=signals.is_set()):
                     continue
                 elapsed, interrupted = self.ranks.largest(elapsed, signals.is_set())
                 state.seconds = seconds_before + elapsed
@@ -178,10 +178,19 @@ class _Run:
             self.findings, waiting, self.model_images,
         )  # fmt: skip
 
+    @property
+    def position(self) -> int:
+        """Batches that the weights have seen."""
+        return self.state.images // self.config.batch_size
+
     def step(self) -> StepLosses:
         """One batch: losses, gradients, update, watcher."""
         config, state = self.config, self.state
-        position, done = state.images // config.batch_size, state.images / config.images
+        position, done = self.position, state.images / config.images
+        if self.watcher is not None and self.watcher.inversion == "due" and not position % READ_EVERY_STEPS:
+            self.task.invert(self.model, self.optimiser)
+            self.watcher.inversion = "done"
+            self.note("surfaces were hollow: reliefs are inverted, with the signs of turns and lights")
         for group in self.optimiser.param_groups:
             rate = group.get("share", 1.0) * config.optimiser.rate(state.images, config.images)
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate

@@ -28,6 +28,7 @@ USUAL_BATCH = 16
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
 MEMORY_IMAGES = 2_000  # over how many images measurements are averaged
+INVERSION = ("", "due", "done")
 SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
 
 
@@ -54,6 +55,7 @@ class Sign:
     advice: str
     grace_images: int = GRACE_IMAGES
     usual_images: int = 0  # how long a healthy run may show it
+    invert: float | None = None  # below it reliefs are inverted, once in a run, which then continues
 
     def is_on(self, measured: float) -> bool:
         return measured > self.limit if self.above else measured < self.limit
@@ -83,6 +85,7 @@ class FiniteWatch:
     """Looks for a loss that is not finite; while ``uneasy``, the present state is no good checkpoint."""
 
     uneasy: bool = field(default=False, init=False)
+    inversion = ""  # of reliefs: "due" or, once in a run, "done"
 
     def note(self, result: Any) -> tuple[list[str], Float[Tensor, " n"]]:
         """Names of a step's stages, and on its device what ``look`` needs of its result (`StepLosses`)."""
@@ -118,6 +121,7 @@ class Watcher(FiniteWatch):
     averages: dict[str, float] = field(default_factory=dict)
     on_since: dict[str, int] = field(default_factory=dict)
     last_images: int = 0
+    inversion: str = ""
     ranks: Ranks = ALONE
 
     @classmethod
@@ -128,7 +132,7 @@ class Watcher(FiniteWatch):
         try:
             watcher = cls(ranges, batch_size, ranks=ranks, **memory)
             numbers = [watcher.last_images, *watcher.averages.values(), *watcher.on_since.values()]
-            if all(type(number) in (int, float) for number in numbers):
+            if all(type(number) in (int, float) for number in numbers) and watcher.inversion in INVERSION:
                 return watcher
         except (TypeError, AttributeError):
             pass
@@ -139,7 +143,8 @@ class Watcher(FiniteWatch):
 
     def memory(self) -> dict[str, Any]:
         averages, on_since = dict(self.averages), dict(self.on_since)
-        return {"averages": averages, "on_since": on_since, "last_images": self.last_images}
+        memory = {"averages": averages, "on_since": on_since, "last_images": self.last_images}
+        return {**memory, "inversion": self.inversion}
 
     def parts(self, result: Any) -> tuple[dict[str, Tensor], list[Tensor]]:
         measured = measure(result.scene, self.ranges)
@@ -173,9 +178,16 @@ class Watcher(FiniteWatch):
             value = self.averages[sign.measure]
             shown = sign.is_on(value) or sign.is_on(latest[sign.measure])
             self.uneasy |= sign.fatal and shown and images >= longer * sign.usual_images
-            if images < longer * sign.grace_images or not sign.is_on(value):
+            limit = None if self.inversion else sign.invert
+            on = sign.is_on(value) if limit is None else value < limit
+            if images < longer * sign.grace_images or not on:
                 self.on_since.pop(sign.name, None)
-            elif images - self.on_since.setdefault(sign.name, images) >= longer * PERSISTENCE_IMAGES:
+            elif images - self.on_since.setdefault(sign.name, images) < longer * PERSISTENCE_IMAGES:
+                continue
+            elif limit is not None:
+                self.inversion = "due"
+                del self.averages[sign.measure], self.on_since[sign.name]
+            else:
                 findings.append(Finding(sign.name, sign.text.format(value=value), sign.advice, sign.fatal))
         return tuple(findings)
 
