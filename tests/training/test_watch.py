@@ -10,6 +10,7 @@ import torch
 import derender
 from derender.data import ImageSet
 from derender.data.synthetic import faces
+from derender.model import Derenderer
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.training import resolve, train
@@ -114,6 +115,14 @@ def test_an_inverted_model_shows_almost_the_same_images_of_reliefs_pressed_in():
     assert apart.abs().mean() < 0.05
     task.invert(model, optimiser)
     torch.testing.assert_close(model.decompose(images).depth, scene.depth)
+
+
+def test_light_from_all_sides_keeps_its_signs():
+    model = Derenderer.from_preset("small", seed=0, renderer="sh", width=4, light_width=4)
+    before = [model.nets[name].decoder.linear.weight.clone() for name in ("light", "camera")]
+    DerenderTask(resolve("small")).invert(model, torch.optim.Adam(model.parameters()))
+    light, camera = (model.nets[name].decoder.linear.weight for name in ("light", "camera"))
+    assert torch.equal(light, before[0]) and torch.equal(camera[:2], -before[1][:2])
 
 
 def test_large_batches_are_given_as_many_updates_not_as_many_images():

@@ -33,8 +33,8 @@ from derender.training.step import StepResult, own_share, training_step
 from derender.training.task import Losses, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
 from derender.training.watch import Watcher
 
-INVERTED = {"geometry": (0,), "light": (2, 3), "camera": (0, 1)}
-"""By factor the outputs that change sign where a relief is pressed in instead of out."""
+INVERTED = {"depth": (0,), "light": (2, 3), "camera": (0, 1)}
+"""By parameter of the scene the outputs that change sign where a relief is pressed in instead of out."""
 
 
 def train(
@@ -139,9 +139,10 @@ class DerenderTask(TrainingTask):
         In the weak perspective of a small field of view both explain an image (the bas-relief ambiguity,
         Belhumeur et al. 1999). Signs of weights of last layers change, and of their gradients' averages.
         """
-        for factor, rows in INVERTED.items():
-            for name, weight in model.nets[factor].decoder.named_parameters():
-                for row in rows if name.endswith(("last.weight", "linear.weight")) else ():
+        for factor in model.factors:
+            for name, weight in model.nets[factor.name].decoder.named_parameters():
+                last = name.endswith(("last.weight", "linear.weight"))
+                for row in INVERTED.get(factor.parameter, ()) if last else ():
                     weight[row].neg_()
                     if weight in optimiser.state:
                         optimiser.state[weight]["exp_avg"][row].neg_()
