@@ -16,7 +16,7 @@ BUDGET = {  # lines, files
     "evaluation": (7_158, 32),  # ridge regression in closed form
     "report": (3_900, 23),  # images that do not suit a model are left out
     "cli": (2_225, 31),  # the same
-    "training": (3_596, 19),  # hollow surfaces; CUDA graphs; networks compiled if asked; framing
+    "training": (3_601, 19),  # hollow surfaces; CUDA graphs; networks compiled if asked; framing
     "baselines": (2_385, 11),
     "render": (1_695, 15),  # unwarp
     "features": (1_300, 8),  # a folder is refused before images are embedded
@@ -31,8 +31,8 @@ BUDGET = {  # lines, files
     "renderers": (655, 8),
     "learn": (915, 5),
 }
-TOTAL = (38_674, 239)  # on the way to (37_000, 270)
-TEST_LINES = 25_873
+TOTAL = (38_679, 239)  # on the way to (37_000, 270)
+TEST_LINES = 25_872
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -15,7 +15,6 @@ from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
 from derender.training import resolve, train
 from derender.training import watch as watching
-from derender.training.derender_task import DerenderTask
 from derender.training.run_folder import read_metrics
 from derender.training.watch import SIGNS, Finding, Watcher
 
@@ -101,26 +100,26 @@ def test_hollow_surfaces_are_inverted_once_and_then_a_failure():
 def test_an_inverted_model_shows_almost_the_same_images_of_reliefs_pressed_in():
     model = derender.load("rendered-faces-64").requires_grad_()
     images = torch.from_numpy(faces.generate(4, seed=1).images) / 255
-    optimiser, task = torch.optim.Adam(model.parameters(), lr=0), DerenderTask(resolve("small"))
+    optimiser = torch.optim.Adam(model.parameters(), lr=0)
     model.render(model.decode(model.encode(images))).image.sum().backward()
     optimiser.step()
     average = optimiser.state[model.nets["light"].decoder.linear.weight]["exp_avg"]
     before, scene = average.clone(), model.decompose(images)
-    task.invert(model, optimiser)
+    watching.invert(model, optimiser)
     inverted = model.decompose(images)
     torch.testing.assert_close(average, before * torch.tensor([1.0, 1, -1, -1])[:, None])
     assert measured(inverted)["bulge"] == pytest.approx(-measured(scene)["bulge"], abs=0.01)
     torch.testing.assert_close(inverted.camera[:, :2], -scene.camera[:, :2])
     apart = (model.render(inverted).image - model.render(scene).image)[..., 16:48, 16:48]
     assert apart.abs().mean() < 0.05
-    task.invert(model, optimiser)
+    watching.invert(model, optimiser)
     torch.testing.assert_close(model.decompose(images).depth, scene.depth)
 
 
 def test_light_from_all_sides_keeps_its_signs():
     model = Derenderer.from_preset("small", seed=0, renderer="sh", width=4, light_width=4)
     before = [model.nets[name].decoder.linear.weight.clone() for name in ("light", "camera")]
-    DerenderTask(resolve("small")).invert(model, torch.optim.Adam(model.parameters()))
+    watching.invert(model, torch.optim.Adam(model.parameters()))
     light, camera = (model.nets[name].decoder.linear.weight for name in ("light", "camera"))
     assert torch.equal(light, before[0]) and torch.equal(camera[:2], -before[1][:2])
 

@@ -33,9 +33,6 @@ from derender.training.step import StepResult, own_share, training_step
 from derender.training.task import Losses, PhaseProgress, Precision, Progress, TrainingTask, TrainResult
 from derender.training.watch import Watcher
 
-INVERTED = {"depth": (0,), "light": (2, 3), "camera": (0, 1)}
-"""By parameter of the scene the outputs that change sign where a relief is pressed in instead of out."""
-
 
 def train(
     config: TrainConfig, images: ImageSet, out: str | Path, *, resume: bool = False,
@@ -131,21 +128,6 @@ class DerenderTask(TrainingTask):
     def watch(self, memory: dict[str, Any]) -> Watcher:
         """The collapse detector."""
         return Watcher.remembering(self.config.model.ranges, self.config.batch_size, memory, self.ranks)
-
-    @torch.no_grad()
-    def invert(self, model: Derenderer, optimiser: torch.optim.Optimizer) -> None:
-        """Press reliefs in instead of out, or the reverse; camera and light then show almost equal images.
-
-        In the weak perspective of a small field of view both explain an image (the bas-relief ambiguity,
-        Belhumeur et al. 1999). Signs of weights of last layers change, and of their gradients' averages.
-        """
-        for factor in model.factors:
-            for name, weight in model.nets[factor.name].decoder.named_parameters():
-                last = name.endswith(("last.weight", "linear.weight"))
-                for row in INVERTED.get(factor.parameter, ()) if last else ():
-                    weight[row].neg_()
-                    if weight in optimiser.state:
-                        optimiser.state[weight]["exp_avg"][row].neg_()
 
 
 def require_perceptual(objective: ObjectiveSettings) -> None:

@@ -187,10 +187,9 @@ class _Run:
         """One batch: losses, gradients, update, watcher."""
         config, state = self.config, self.state
         position, done = self.position, state.images / config.images
-        if self.watcher is not None and self.watcher.inversion == "due" and not position % READ_EVERY_STEPS:
-            self.task.invert(self.model, self.optimiser)
-            self.watcher.inversion = "done"
-            self.note("surfaces were hollow: reliefs are inverted, with the signs of turns and lights")
+        watched = self.watcher if position % READ_EVERY_STEPS == 0 else None
+        if watched is not None and (repaired := watched.repair(self.model, self.optimiser)):
+            self.note(repaired)
         for group in self.optimiser.param_groups:
             rate = group.get("share", 1.0) * config.optimiser.rate(state.images, config.images)
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate

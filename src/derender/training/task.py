@@ -86,10 +86,6 @@ class TrainingTask(ABC):
         """A watcher that continues from ``memory``; by default of the loss, which needs none."""
         return FiniteWatch()
 
-    def invert(self, model: Any, optimiser: torch.optim.Optimizer) -> None:
-        """Change the sign of a model's reliefs; asked for by a watcher whose ``inversion`` is "due"."""
-        raise NotImplementedError
-
 
 def compute_step(
     module: nn.Module, images: Float[Tensor, "n 3 h w"], generator: Generator, precision: Precision,

@@ -28,6 +28,8 @@ USUAL_BATCH = 16
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
 MEMORY_IMAGES = 2_000  # over how many images measurements are averaged
+INVERTED = {"depth": (0,), "light": (2, 3), "camera": (0, 1)}
+"""By parameter of the scene the outputs that change sign where a relief is pressed in instead of out."""
 INVERSION = ("", "due", "done")
 SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
 
@@ -85,7 +87,6 @@ class FiniteWatch:
     """Looks for a loss that is not finite; while ``uneasy``, the present state is no good checkpoint."""
 
     uneasy: bool = field(default=False, init=False)
-    inversion = ""  # of reliefs: "due" or, once in a run, "done"
 
     def note(self, result: Any) -> tuple[list[str], Float[Tensor, " n"]]:
         """Names of a step's stages, and on its device what ``look`` needs of its result (`StepLosses`)."""
@@ -107,6 +108,10 @@ class FiniteWatch:
         text, advice = f"the loss is {note[0]}{first}", "use a smaller learning_rate"
         return (Finding("non-finite loss", text, advice, True),)
 
+    def repair(self, model: Any, optimiser: torch.optim.Optimizer) -> str:
+        """Mend a model where that is due; in plain words what was done, here never anything."""
+        return ""
+
     def memory(self) -> dict[str, Any]:
         """The state that a resumed run needs to go on watching: here none."""
         return {}
@@ -121,7 +126,7 @@ class Watcher(FiniteWatch):
     averages: dict[str, float] = field(default_factory=dict)
     on_since: dict[str, int] = field(default_factory=dict)
     last_images: int = 0
-    inversion: str = ""
+    inversion: str = ""  # of reliefs: "due" or, once in a run, "done"
     ranks: Ranks = ALONE
 
     @classmethod
@@ -145,6 +150,13 @@ class Watcher(FiniteWatch):
         averages, on_since = dict(self.averages), dict(self.on_since)
         memory = {"averages": averages, "on_since": on_since, "last_images": self.last_images}
         return {**memory, "inversion": self.inversion}
+
+    def repair(self, model: Any, optimiser: torch.optim.Optimizer) -> str:
+        if self.inversion != "due":
+            return ""
+        invert(model, optimiser)
+        self.inversion = "done"
+        return "surfaces were hollow: reliefs are inverted, with the signs of turns and lights"
 
     def parts(self, result: Any) -> tuple[dict[str, Tensor], list[Tensor]]:
         measured = measure(result.scene, self.ranges)
@@ -195,6 +207,22 @@ class Watcher(FiniteWatch):
 def _first(names: Sequence[str], finite: Sequence[float]) -> str | None:
     """The first name beside which stands no 1."""
     return next((name for name, one in zip(names, finite, strict=False) if not one), None)
+
+
+@torch.no_grad()
+def invert(model: Any, optimiser: torch.optim.Optimizer) -> None:
+    """Press reliefs in instead of out, or the reverse; camera and light then show almost equal images.
+
+    In the weak perspective of a small field of view both explain an image (the bas-relief ambiguity,
+    Belhumeur et al. 1999). Signs of weights of last layers change, and of their gradients' averages.
+    """
+    for factor in model.factors:
+        for name, weight in model.nets[factor.name].decoder.named_parameters():
+            last = name.endswith(("last.weight", "linear.weight"))
+            for row in INVERTED.get(factor.parameter, ()) if last else ():
+                weight[row].neg_()
+                if weight in optimiser.state:
+                    optimiser.state[weight]["exp_avg"][row].neg_()
 
 
 @torch.no_grad()
