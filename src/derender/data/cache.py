@@ -102,7 +102,4 @@ def write_cache(
 
 def sample_checksum(rows: np.ndarray) -> int:
     """CRC of at most 64 rows."""
-    checksum = 0
-    for row in evenly_spaced(len(rows), 64):
-        checksum = zlib.crc32(rows[row].tobytes(), checksum)
-    return checksum
+    return zlib.crc32(rows[evenly_spaced(len(rows), 64)].tobytes())

@@ -96,7 +96,11 @@ def decode(
         raise Unreadable("no usable box is known for the part to read")
     with _opened(encoded, pixel_limit) as opened:
         width = opened.width
-        _reduce_while_decoding(opened, image_size, fit, box)
+        short, long = sorted(opened.size if box is None else (box[2:] - box[:2]).tolist())
+        kept = long if fit in ("pad", "room") else short
+        if opened.format in ("JPEG", "MPO") and kept >= 4 * image_size:
+            scale = 2 * image_size / kept  # the decoder takes 1/2, 1/4 or 1/8, never less than this
+            opened.draft(None, (int(width * scale), int(opened.height * scale)))
         large = opened.width * opened.height > _LARGE_PIXELS
         with one_large_image_at_a_time if large else nullcontext():
             image = upright_rgb(opened)
@@ -177,17 +181,6 @@ def _known_formats() -> tuple[str, ...]:
     return tuple(form for form in _FORMATS if form in Image.OPEN)
 
 
-def _reduce_while_decoding(
-    opened: Image.Image, image_size: int, fit: str, box: Float32[np.ndarray, "4"] | None
-) -> None:
-    """Let the JPEG decoder scale by 1/2, 1/4 or 1/8, never below twice the size that is needed."""
-    short, long = sorted(opened.size if box is None else (box[2:] - box[:2]).tolist())
-    kept = long if fit in ("pad", "room") else short
-    if opened.format in ("JPEG", "MPO") and kept >= 4 * image_size:
-        scale = 2 * image_size / kept
-        opened.draft(None, (int(opened.width * scale), int(opened.height * scale)))
-
-
 def _cut(image: Image.Image, box: Float32[np.ndarray, "4"]) -> Image.Image:
     """The part in the box, to the nearest pixel; a square box stays square."""
     sides = np.maximum(1, np.round(box[2:] - box[:2])).astype(int)
@@ -266,12 +259,7 @@ def as_batch(
         ValueError: values outside 0..1, or an array that is no image; the message says how to convert it.
         FileNotFoundError: there is no such file.
     """
-    if (
-        isinstance(images, Tensor)
-        and images.ndim == 4
-        and images.is_floating_point()
-        and images.shape[-1] != 3
-    ):
+    if torch.is_tensor(images) and images.ndim == 4 and images.is_floating_point() and images.shape[-1] != 3:
         check_images(images, size)
         refuse_values(images)
         return images.float()
@@ -298,9 +286,8 @@ def as_photos(images: GivenImages) -> list[UInt8[np.ndarray, "h w 3"]]:
         images = (images.float() if images.dtype == torch.bfloat16 else images).detach().cpu().numpy()
     if not isinstance(images, np.ndarray):
         if not isinstance(images, Sequence) or not images:
-            raise TypeError(
-                f"expected a path, a Pillow image, an array, a tensor or a list of them, got {images!r:.80}"
-            )
+            expected = "a path, a Pillow image, an array, a tensor or a list of them"
+            raise TypeError(f"expected {expected}, got {images!r:.80}")
         return [photo for image in images for photo in as_photos(image)]
     shape = images.shape
     batch = np.repeat(images[..., None], 3, axis=-1) if images.ndim == 2 else images
@@ -352,9 +339,8 @@ def refuse_values(images: Tensor | np.ndarray) -> None:
 def check_images(images: Tensor, size: int) -> None:
     """Images of another shape than (N, 3, size, size), or of whole numbers, are an error."""
     if images.ndim != 4 or images.shape[1:] != (3, size, size):
-        raise ValueError(
-            f"this model takes images of shape (N, 3, {size}, {size}), got {tuple(images.shape)}: "
-            f"read them with derender.data.read_images(..., image_size={size}) or resize them"
-        )
+        fix = f"read them with derender.data.read_images(..., image_size={size}) or resize them"
+        shape = tuple(images.shape)
+        raise ValueError(f"this model takes images of shape (N, 3, {size}, {size}), got {shape}: {fix}")
     if not images.is_floating_point():
         raise ValueError(f"images must be floating point in 0..1, got {images.dtype}: divide uint8 by 255")

@@ -60,22 +60,17 @@ def split_indices(
         alone = [str(group) in ("", "nan") for group in groups]
         rows = zip(names, groups, alone, strict=True)
         keys = [f"file {name}" if single else f"group {group}" for name, group, single in rows]
-    members: dict[str, list[int]] = {}
-    for row, key in enumerate(keys):
-        members.setdefault(key, []).append(row)
-
-    def digest(key: str) -> bytes:
-        return hashlib.sha256(f"{seed}\0{key}".encode("utf-8", "surrogateescape")).digest()
-
+    salted = (f"{seed}\0{key}".encode("utf-8", "surrogateescape") for key in keys)
+    digests = [hashlib.sha256(one).hexdigest() for one in salted]
     exact = len(names) * np.array(fractions)
     counts = (exact + 1e-9).astype(int)
     largest_remainders = np.argsort(counts - exact, kind="stable")[: len(names) - counts.sum()]
     counts[largest_remainders] += 1
-    ordered = sorted(members, key=digest)
-    ends = np.cumsum([0, *(len(members[key]) for key in ordered)])
+    _, group, sizes = np.unique(digests, return_inverse=True, return_counts=True)
+    ends = np.cumsum([0, *sizes])
     cuts = [int(np.abs(ends - end).argmin()) for end in np.cumsum(counts)[:2]]
-    parts = (ordered[: cuts[0]], ordered[cuts[0] : cuts[1]], ordered[cuts[1] :])
-    return Split(*(np.array(sorted(row for key in part for row in members[key]), np.int64) for part in parts))
+    part = np.searchsorted(cuts, group, side="right")
+    return Split(*(np.flatnonzero(part == place) for place in range(3)))
 
 
 MEMORY_LIMIT_BYTES = 2 << 30

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from urllib.parse import parse_qsl
 
-from derender.data.layouts import layout_named, recognise
+from derender.data.layouts import LAYOUTS, layout_named
 from derender.data.layouts.layout import Layout, Table, half_of
 from derender.data.layouts.tables import TABLE_SUFFIXES, TableSource, holds_paths
 from derender.data.source import FileSource, FolderSource, Source, ZipSource, is_hidden, is_image
@@ -106,7 +106,7 @@ def list_images(
     files = open_source(Path(place).expanduser())
     try:
         half = half_named(source, options)
-        layout = layout or recognise(files)
+        layout = layout or next(one for one in LAYOUTS if one.recognise(files))
         table = half_of(layout.read(files, subset), half)
         if not table.files:
             raise ValueError(_nothing_found(files))
@@ -135,9 +135,8 @@ def open_source(path: Path) -> Source:
         return FileSource(path)
     if path.is_file() and (path.suffix.lower() == ".zip" or zipfile.is_zipfile(path)):
         return ZipSource(path)
-    raise ValueError(
-        f"{path} is no folder, zip or image ({' '.join(SUFFIXES)}); unpack other archives into a folder"
-    )
+    known = f"folder, zip or image ({' '.join(SUFFIXES)})"
+    raise ValueError(f"{path} is no {known}; unpack other archives into a folder")
 
 
 def parse_source(source: str | Path, subset: str | None = None) -> tuple[str, str | None, dict[str, str]]:
@@ -146,21 +145,16 @@ def parse_source(source: str | Path, subset: str | None = None) -> tuple[str, st
     A part that was named separately is ``subset``; another one in ``source`` is a ValueError.
     """
     if not isinstance(source, str | Path):
-        raise TypeError(
-            f"expected a folder, zip, shards or Hugging Face id, got {type(source).__name__}: "
-            "arrays and Pillow images go to model.embed or model.decompose"
-        )
+        expected = f"expected a folder, zip, shards or Hugging Face id, got {type(source).__name__}"
+        raise TypeError(f"{expected}: arrays and Pillow images go to model.embed or model.decompose")
     text = str(source)
     if Path(text).expanduser().exists():
         return text, subset, {}
-    left, separator, part = text.rpartition("::")
-    if not separator:
-        left, part = text, ""
-    elif not left or not part:
+    left, _, part = text.rpartition("::") if "::" in text else (text, "", subset)
+    if "::" in text and not (left and part):
         raise ValueError(f"{text} should read PATH::SUBSET, with both parts")
-    if part and subset not in (None, part):
+    if subset not in (None, part):
         raise ValueError(f"{source} names the part {part!r}, but subset={subset!r} was given too; give one")
-    part = part or subset
     place, _, query = left.partition("?")
     if not query or Path(left).expanduser().exists():
         return left, part, {}

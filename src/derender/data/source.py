@@ -26,7 +26,7 @@ from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from posixpath import basename, dirname
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from jaxtyping import Int64
@@ -50,16 +50,13 @@ class Skipped:
     reason: str
 
 
-C = TypeVar("C", bound="Closing")
-
-
 class Closing:
     """What may hold files open until it is closed, or left as a context."""
 
     def close(self) -> None:
         """Release what is held open."""
 
-    def __enter__(self: C) -> C:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -109,9 +106,8 @@ class Source(Closing, ABC):
         try:
             return self.read(file).decode("utf-8-sig")
         except UnicodeDecodeError as problem:
-            raise ValueError(
-                f"{file} in {self.path} is not UTF-8 text ({problem.reason}); save it as UTF-8"
-            ) from problem
+            fault = f"is not UTF-8 text ({problem.reason}); save it as UTF-8"
+            raise ValueError(f"{file} in {self.path} {fault}") from problem
 
 
 class FileSource(Source):
@@ -179,9 +175,8 @@ class ZipSource(Source):
         try:
             self._archive = zipfile.ZipFile(path)
         except DECODER_ERRORS as problem:
-            raise ValueError(
-                f"{path} is damaged or not a whole zip file ({problem}); download or copy it again"
-            ) from problem
+            fault = f"is damaged or not a whole zip file ({problem}); download or copy it again"
+            raise ValueError(f"{path} {fault}") from problem
         self._members: dict[str, zipfile.ZipInfo] = {}
         faults: set[tuple[str, str]] = set()
         for member in self._archive.infolist():

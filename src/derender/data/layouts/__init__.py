@@ -52,6 +52,7 @@ _READERS = {  # by name: whether a source looks like the layout, and the table o
     "folder": (lambda source: True, _load_folder),
 }
 LAYOUTS = tuple(Layout(name, *readers, **TOLD[name]) for name, readers in _READERS.items())
+"""The first that a source looks like is its own; a plain folder fits everything."""
 
 
 def layout_named(name: str) -> Layout:
@@ -59,8 +60,3 @@ def layout_named(name: str) -> Layout:
     by_name = {layout.name: layout for layout in LAYOUTS}
     require_known("data set", name.lower(), tuple(by_name))
     return by_name[name.lower()]
-
-
-def recognise(source: Source) -> Layout:
-    """The first layout that the source looks like; a plain folder fits everything."""
-    return next(layout for layout in LAYOUTS if layout.recognise(source))

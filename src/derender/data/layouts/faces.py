@@ -21,17 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from derender.data.layouts.layout import (
-    PARTITION_NAMES,
-    TOLD,
-    Labels,
-    Table,
-    header_of,
-    mostly,
-    read_csv,
-    read_list,
-    text_column,
-)
+from derender.data.layouts import layout
+from derender.data.layouts.layout import Labels, Table, read_csv, read_list, text_column
 from derender.data.layouts.rendered import track_labels
 from derender.data.source import Source, parent_name, stem_of
 
@@ -121,11 +112,8 @@ def load_rafdb(source: Source) -> Table | None:
     if not emotions.keys() & set(names):
         raise ValueError(f"{file} in {source.path} names none of its images; the first is {files[0]!r}")
     parts = (name.partition("_")[0] for name in names)
-    return Table(
-        files,
-        {"emotion": text_column(emotions.get(name, "") for name in names)},
-        text_column(part if part in ("train", "test") else "" for part in parts),
-    )
+    partition = text_column(part if part in ("train", "test") else "" for part in parts)
+    return Table(files, {"emotion": text_column(emotions.get(name, "") for name in names)}, partition)
 
 
 def is_tracks(source: Source) -> bool:
@@ -133,7 +121,7 @@ def is_tracks(source: Source) -> bool:
     if _track_lists(source):
         return bool(source.images)
     matches = [match for file in source.images if (match := _NUMBERED.fullmatch(file))]
-    people = {match["identity"] for match in matches} - PARTITION_NAMES.keys()
+    people = {match["identity"] for match in matches} - layout.PARTITION_NAMES.keys()
     return len(matches) == len(source.images) and len(people) > 1
 
 
@@ -154,7 +142,7 @@ def load_tracks(source: Source) -> Table | None:
 
 
 def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
-    home = TOLD["face_tracks"]["home"]
+    home = layout.TOLD["face_tracks"]["home"]
     expected = f"a first line {_TRACKS_HEADER}, then a track's number and a name a line, as at {home}"
     people: dict[tuple[str, int], str] = {}
     for episode, file in lists.items():
@@ -185,9 +173,7 @@ BOX_LIST = "boxes.csv"
 _PARTITIONS = {"0": "train", "1": "validation", "2": "test"}
 _IN_ORDER = np.array(["", *_PARTITIONS.values()])  # the parts are runs of image numbers, from these on
 _FIRST_NUMBERS = (1, 162_771, 182_638)
-_EYES_AND_MOUTH = [
-    f"{side}{part}_{axis}" for part in ("eye", "mouth") for side in ("left", "right") for axis in "xy"
-]
+_POINTS = [f"{name}_{axis}" for name in ("lefteye", "righteye", "leftmouth", "rightmouth") for axis in "xy"]
 _SIZED, _SIDES = ("left", "top", "width", "height"), ("left", "top", "right", "bottom")
 _MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 
@@ -287,12 +273,11 @@ def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 
         return _own_boxes(source, own, names)
     if landmarks is None:
         raise ValueError(
-            f"{source.path} holds CelebA's images in the wild (img_celeba), but no "
-            "list_landmarks_celeba.txt, which says where faces are. "
-            f"The owners publish it at {TOLD['celeba']['home']}. "
+            f"{source.path} holds CelebA's images in the wild (img_celeba), but no list_landmarks_celeba.txt,"
+            f" which says where faces are. The owners publish it at {layout.TOLD['celeba']['home']}. "
             f"A list of your own may stand in for it: {BOX_LIST}, with rows of file,{','.join(_SIZED)}"
         )
-    points = landmarks.numbers(_EYES_AND_MOUTH, names).reshape(-1, 4, 2)
+    points = landmarks.numbers(_POINTS, names).reshape(-1, 4, 2)
     eyes, mouth = points[:, :2].mean(axis=1), points[:, 2:].mean(axis=1)
     apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
     down = np.linalg.norm(eyes - mouth, axis=1)
@@ -302,7 +287,7 @@ def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 
 
 def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.ndarray, "n 4"]:
     """The boxes of a list that the user made; an image without a row or with an empty box is an error."""
-    columns = _SIZED if "width" in header_of(source, file) else _SIDES
+    columns = _SIZED if "width" in layout.header_of(source, file) else _SIDES
     rows = read_csv(source, file, ("file", *columns))
     by_name = {basename(row["file"]): [row[column] for column in columns] for row in rows}
     listed = _OwnersList(f"{file} in {source.path}", columns, by_name)
@@ -346,7 +331,7 @@ def _mask_names(source: Source) -> dict[str, str]:
 
 
 def is_celebamask(source: Source) -> bool:
-    return mostly(bool, _mask_names(source).values())
+    return layout.mostly(bool, _mask_names(source).values())
 
 
 def load_celebamask(source: Source) -> Table | None:

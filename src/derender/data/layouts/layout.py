@@ -84,11 +84,9 @@ class Layout:
         """The images of one part: of the official split, else those in a folder of that name at any depth."""
         table = self.load(source)
         if table is None:
+            what = f"{source.path} cannot be read as {self.name} ({self.title})"
             owners = f"; its owners publish it at {self.home}" if self.home else ""
-            raise ValueError(
-                f"{source.path} cannot be read as {self.name} ({self.title}): expected "
-                f"{self.expected}{owners}"
-            )
+            raise ValueError(f"{what}: expected {self.expected}{owners}")
         known = set() if table.partition is None else {*table.partition.tolist()}
         parts = sorted(known - {""})
         if subset is None and self.default_parts and len(known) > 1:

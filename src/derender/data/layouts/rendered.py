@@ -15,27 +15,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from derender.data.image import DECODER_ERRORS, upright_size
-from derender.data.layouts.layout import (
-    Labels,
-    Table,
-    header_of,
-    mostly,
-    partition_column,
-    partition_named,
-    partitions,
-    read_csv,
-    text_column,
-)
+from derender.data.layouts import layout
+from derender.data.layouts.layout import Labels, Table, partition_column, read_csv, text_column
 from derender.data.source import Source, parent_name, stem_of
 from derender.storage.bounded import table_beside
 
 LIGHT = ("ambient", "diffuse", "light_pitch_rad", "light_yaw_rad")
 CAMERA = ("camera_x_rad", "camera_y_rad", "camera_z_rad", "camera_tx", "camera_ty")
 
-_NAMES = table_beside(__file__, "rendered.yaml")
-_NUMBERS, _DEGREES, _TEXTS, CAR_CLASSES = (
-    _NAMES[kind] for kind in ("numbers", "degrees", "texts", "car_classes")
-)
+_NUMBERS, _DEGREES, _TEXTS, CAR_CLASSES = table_beside(__file__, "rendered.yaml").values()
 _TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+\.\w+")
 
 _ID = re.compile(r"(?<![0-9a-f])[0-9a-f]{24,32}(?![0-9a-f])")
@@ -96,10 +84,8 @@ def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) ->
             try:
                 values = np.array([float(row.get(name) or "nan") for row in rows])
             except ValueError as problem:
-                raise ValueError(
-                    f"params.csv in {source.path}: column {name!r} holds something that is no number "
-                    f"({problem})"
-                ) from problem
+                where = f"params.csv in {source.path}: column {name!r}"
+                raise ValueError(f"{where} holds something that is no number ({problem})") from problem
             labels[label] = (values * (math.pi / 180 if name in _DEGREES else 1)).astype(np.float32)
     return labels
 
@@ -122,7 +108,7 @@ def load_rendered(source: Source) -> Table | None:
 def columns(source: Source) -> list[str]:
     """The columns of the first params.csv, none without any."""
     folders = rendered_folders(source)
-    return header_of(source, f"{folders[0]}params.csv") if folders else []
+    return layout.header_of(source, f"{folders[0]}params.csv") if folders else []
 
 
 def is_tracks(source: Source) -> bool:
@@ -148,37 +134,33 @@ def load_pairs(source: Source) -> Table:
     """The images without their maps, with the owners' split where the folders give one."""
     files = tuple(pairs_of(source))
     around = (file.split("/")[-3:-2] for file in files)
-    return Table(files, partition=partition_column(map(partition_named, around)))
+    return Table(files, partition=partition_column(map(layout.partition_named, around)))
 
 
 def _table_of(source: Source) -> str | None:
     """ShapeNet's table, recognised by its columns, or None."""
     candidates = [file for name in _TABLES if (file := source.named(name)) is not None]
-    return next((file for file in candidates if "fullId" in header_of(source, file)), None)
+    return next((file for file in candidates if "fullId" in layout.header_of(source, file)), None)
 
 
 def is_cars(source: Source) -> bool:
     ours = _table_of(source) is not None or any(_CARS in file.split("/") for file in source.images[:1])
-    return ours and mostly(_ID.search, source.images)
+    return ours and layout.mostly(_ID.search, source.images)
 
 
 def load_cars(source: Source) -> Table | None:
     files = tuple(file for file in source.images if not _MAPS & set(file.split("/")[:-1]))
     models = [results[0] if (results := _ID.search(file)) else "" for file in files]
-    partition = partitions(files)
+    partition = layout.partitions(files)
     if not any(models) and partition is None:
         return None
     labels: Labels = {"model": text_column(models)} if any(models) else {}
     if (table := _table_of(source)) is not None:
-        known = {
-            row["fullId"].rpartition(".")[2]: (row["name"], _car_class(row))
-            for row in read_csv(source, table, ("fullId", "wnlemmas", "name", "tags"))
-        }
+        rows = read_csv(source, table, ("fullId", "wnlemmas", "name", "tags"))
+        known = {row["fullId"].rpartition(".")[2]: (row["name"], _car_class(row)) for row in rows}
         if not known.keys() & set(models):
-            raise ValueError(
-                f"{table} in {source.path} names none of the models there; ShapeNet's owners publish "
-                f"the table of cars ({_CARS}) at https://shapenet.org"
-            )
+            where = f"ShapeNet's owners publish the table of cars ({_CARS}) at https://shapenet.org"
+            raise ValueError(f"{table} in {source.path} names none of the models there; {where}")
         results = [known.get(model, ("", "")) for model in models]
         labels["name"], labels["class"] = map(text_column, zip(*results, strict=True))
     try:  # the published crop for every image if the first one has the published size
@@ -192,7 +174,5 @@ def load_cars(source: Source) -> Table | None:
 def _car_class(row: Mapping[str, str]) -> str:
     """The class of a car in a row of ShapeNet's table: a key of ``CAR_CLASSES``, or ""."""
     text = " , ".join(row[name] for name in ("name", "tags", "wnlemmas")).lower().replace("_", " ")
-    for kind, words in CAR_CLASSES.items():
-        if re.search(rf"\b({'|'.join(words)})s?\b", text):
-            return kind
-    return ""
+    fits = (kind for kind, words in CAR_CLASSES.items() if re.search(rf"\b({'|'.join(words)})s?\b", text))
+    return next(fits, "")
