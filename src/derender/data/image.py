@@ -170,10 +170,7 @@ def quiet_pillow() -> Iterator[None]:
 
 @cache
 def _known_formats() -> tuple[str, ...]:
-    """Those of our formats that this build of Pillow opens (AVIF may lack), never PostScript and the like.
-
-    HEIC is among them where the package pillow-heif is installed.
-    """
+    """Our formats that this Pillow opens (AVIF may lack; HEIC needs pillow-heif), never PostScript."""
     logging.getLogger("PIL").addHandler(logging.NullHandler())  # what is wrong with a file is raised, too
     Image.init()
     with suppress(ImportError):

@@ -91,10 +91,9 @@ def read_masks(
             files = stream.files
             _require_masks(files, stream.table.files, stream.table.labels["mask"].tolist())
         else:
-            raise ValueError(
-                f"{stream.source} holds no masks (it was read as {stream.layout}): expected images/NAME.jpg "
-                "with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
-            )
+            expected = "images/NAME.jpg with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
+            read_as = f"it was read as {stream.layout}"
+            raise ValueError(f"{stream.source} holds no masks ({read_as}): expected {expected}")
         classes = len(MASK_CLASSES) if own else MOST_CLASSES
         named = f"0 ({MASK_CLASSES[0]}) to {classes - 1} ({MASK_CLASSES[-1]})"
         limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
@@ -152,10 +151,9 @@ def read_ground_truth(
 def _require_masks(source: Source, images: Sequence[str], masks: Sequence[str]) -> None:
     """Every image has a mask in the source, or an error says how many have none."""
     if bare := [image for image, mask in zip(images, masks, strict=True) if not mask]:
-        raise ValueError(
-            f"{len(bare):,} of {len(images):,} images have no mask in {source.path}, the first is "
-            f"{bare[0]!r}; add the masks (NAME.png for NAME.jpg), or take these images out"
-        )
+        what = f"{len(bare):,} of {len(images):,} images have no mask in {source.path}"
+        fix = "add the masks (NAME.png for NAME.jpg), or take these images out"
+        raise ValueError(f"{what}, the first is {bare[0]!r}; {fix}")
 
 
 def _numbers(source: Source, file: str, classes: int, limits: str) -> UInt8[np.ndarray, "h w"]:
@@ -217,8 +215,7 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
         expected = "".join(map_names("depth")[:1])
         raise ValueError(f"{source.path} has no depth maps for its images (expected {expected})")
     table = table.select(with_depth).at_most(limit)
-    missing = [name for name in (*LIGHT, *CAMERA) if name not in table.labels]
-    if missing:
+    if missing := [name for name in (*LIGHT, *CAMERA) if name not in table.labels]:
         raise ValueError(f"the params.csv in {source.path} lacks the column for {missing[0]!r}")
 
     def maps(kind: str, *modes: str) -> np.ndarray | None:
@@ -273,16 +270,13 @@ def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -
         if image_size is not None:
             image = image.resize((image_size, image_size), Image.Resampling.BOX)
         if not (image.height, image.width) == depth.shape == (depths or [depth])[0].shape:
-            raise ValueError(
-                f"{file} in {source.path} is {image.size}, its map {map_file} {depth.shape[::-1]}: both "
-                "must have one size, the same in the whole set; or give image_size"
-            )
+            sizes = f"{image.size}, its map {map_file} {depth.shape[::-1]}"
+            rule = "both must have one size, the same in the whole set; or give image_size"
+            raise ValueError(f"{file} in {source.path} is {sizes}: {rule}")
         images.append(np.asarray(image))
         depths.append(depth)
-    depth = np.stack(depths)
-    nothing = dict.fromkeys(("normal", "albedo", "light", "camera"))
-    exact = {"images": _channels_first(np.stack(images)), "depth": depth, "mask": depth > 0}
-    return GroundTruth(**exact, **nothing, files=tuple(pairs), labels={})
+    depth, whole = np.stack(depths), _channels_first(np.stack(images))
+    return GroundTruth(whole, depth, None, None, depth > 0, None, None, files=tuple(pairs), labels={})
 
 
 def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarray, "h w"]:
@@ -300,10 +294,8 @@ def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarr
     depth = np.where(mask, far - (far - near) * nearness, 0).astype(np.float32)
     if size is None or depth.shape == (size, size):
         return depth
-    by_area, share = (
-        np.asarray(Image.fromarray(one.astype(np.float32)).resize((size, size), Image.Resampling.BOX))
-        for one in (depth, mask)
-    )
+    whole = [Image.fromarray(one.astype(np.float32)) for one in (depth, mask)]
+    by_area, share = (np.asarray(one.resize((size, size), Image.Resampling.BOX)) for one in whole)
     small = share > 0.5
     return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32)
 

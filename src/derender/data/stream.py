@@ -35,8 +35,7 @@ class Sample:
     # gives its encoded bytes, or raises ValueError or OSError with the reason; any thread may call it, once
     read: Callable[[], bytes]
     share: float | None = None  # how much of the stream lies before the next sample, 0..1; None: unknown
-    # value by column; a column that is not here is unknown for this image
-    labels: Mapping[str, Value] = field(default_factory=dict)
+    labels: Mapping[str, Value] = field(default_factory=dict)  # by column; one that is not here is unknown
     partition: str = ""  # the owners' own split ("train", "validation", "test"), or ""
     box: np.ndarray | None = None  # the part that is read (``Table.boxes``), or None for all of it
     fit: str = "crop"  # what becomes of it if it is not square and its reader does not say
@@ -76,16 +75,10 @@ def unreadable(reason: str) -> Callable[[], bytes]:
     return refuse
 
 
-def label_name(name: str) -> str:
-    """A column's name as a label: ``file`` is taken by our own names, so it becomes ``original_file``."""
-    return "original_file" if name == "file" else name
-
-
 def kinds_of(rows: Iterable[Mapping[str, Value]]) -> dict[str, str | None]:
     """What each column of labels holds: "text", "number", "flag", or None where all is unknown.
 
-    A column of several kinds is text, and so are whole numbers that float32 cannot hold (above 2^24:
-    identifiers, as a rule).
+    A column of several kinds is text, and so are whole numbers above 2^24, which float32 cannot hold.
     """
     kinds: dict[str, str | None] = {}
     for name, value in chain.from_iterable(row.items() for row in rows):
@@ -120,7 +113,7 @@ class Decoded(NamedTuple):
     file: str
     pixels: UInt8[np.ndarray, "3 s s"] | None  # RGB; None: unreadable, or needed no more
     outcome: bytes | Unreadable  # the digest of the pixels, or why there are none
-    labels: Mapping[str, Value]
+    labels: Mapping[str, Value]  # a column ``file`` is ``original_file`` here: that name is taken
     partition: str
     share: float | None  # how much of the stream has been read, 0..1; None where that is unknown
 
@@ -167,8 +160,8 @@ def decode_samples(start: int, samples: Iterable[Sample], image_size: int, fit: 
             outcome = Unreadable(str(problem))
         except OSError as problem:
             outcome = Unreadable(f"cannot be read: {problem.strerror or problem}")
-        known = sample.labels, sample.partition, sample.share
-        result.append(Decoded(number, sample.file, pixels, outcome, *known))
+        labels = {"original_file" if name == "file" else name: one for name, one in sample.labels.items()}
+        result.append(Decoded(number, sample.file, pixels, outcome, labels, sample.partition, sample.share))
     return result
 
 

@@ -27,7 +27,7 @@ from typing import Any
 
 from derender.data.layouts.layout import partition_named
 from derender.data.source import is_hidden, is_image, printable, stamps_of
-from derender.data.stream import Sample, Stream, Value, label_name, unreadable
+from derender.data.stream import Sample, Stream, Value, unreadable
 from derender.storage.bounded import FILE_LIMIT_BYTES, read_bounded
 from derender.storage.places import optional, suggestion
 
@@ -152,12 +152,10 @@ def find_shards(path: Path, source: str, part: str | None = None) -> list[Path]:
             raise ValueError(f"{path} holds no shards ({' '.join(SHARD_SUFFIXES)})")
     else:
         shards = [path] if path.exists() else [Path(name) for name in expand_braces(str(path))]
-    absent = [shard for shard in shards if not shard.is_file()]
-    if absent:
+    if absent := [shard for shard in shards if not shard.is_file()]:
         missing = f"{len(absent):,} of the {len(shards):,} shards of {source} do not exist"
         raise ValueError(f"{missing}; the first is {absent[0]}")
-    chosen = [shard for shard in shards if part is None or part in _series(shard)]
-    if not chosen:
+    if not (chosen := [shard for shard in shards if part is None or part in _series(shard)]):
         known = sorted({name for shard in shards for name in _series(shard)})
         raise ValueError(f"{path} has no shards of a part {part!r}; there are {', '.join(known)}")
     return chosen
@@ -198,7 +196,7 @@ def _labels(content: Mapping[str, bytes | None]) -> dict[str, Value]:
             raise ValueError(f"its .json cannot be read ({problem})") from problem
         if not isinstance(values, dict):
             raise ValueError(f"its .json holds a {type(values).__name__}, expected an object")
-        labels = {label_name(name): value for name, value in values.items() if isinstance(value, Value)}
+        labels = {name: value for name, value in values.items() if isinstance(value, Value)}
     if (text := content.get("cls")) is not None:
         try:
             labels["class"] = text.decode("utf-8").strip()
@@ -236,10 +234,13 @@ class HuggingFaceStream(Stream):
             raise ValueError(f"{source}: {hint}; there are {', '.join(splits)}, and all of them as ::all")
         names = list(splits) if part == "all" else [part]
         self._column, self._labels = _columns(splits[names[0]], column, source)
-        self._counts = {name: _count(splits[name]) for name in names}
+        self._counts: dict[str, int] = {}  # 0 where it is not known without reading
         self._splits: dict[str, Any] = {}
         for name in names:  # these columns only, images as encoded bytes
-            rows = splits[name].select_columns([self._column, *self._labels])
+            rows = splits[name]
+            known = getattr((rows.info.splits or {}).get(str(rows.split)), "num_examples", None)
+            self._counts[name] = getattr(rows, "num_rows", None) or known or 0
+            rows = rows.select_columns([self._column, *self._labels])
             rows = rows.cast_column(self._column, datasets.Image(decode=False))
             streamed = isinstance(rows, datasets.IterableDataset)
             self._splits[name] = rows if streamed else rows.to_iterable_dataset()
@@ -281,7 +282,7 @@ class HuggingFaceStream(Stream):
             value, names = values[column], getattr(feature, "names", None)
             if names is not None and value is not None:
                 value = names[value] if 0 <= value < len(names) else None
-            labels[label_name(column)] = value
+            labels[column] = value
         return Sample(name, read, share, labels, partition_named([split]))
 
 
@@ -337,19 +338,10 @@ def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str,
     if column is not None and column not in images:
         hint = suggestion(column, images)
         raise ValueError(f"{source} has no column of images {column!r}{hint}; there is {', '.join(images)}")
-
-    labels = {}
-    for name, one in features.items():
-        plain = isinstance(one, datasets.Value) and one.dtype.startswith(_LABEL_KINDS)
-        if plain or isinstance(one, datasets.ClassLabel):
-            labels[name] = one
+    scalars = (datasets.Value, datasets.ClassLabel)  # the numbers of classes are integers
+    plain = {name: one for name, one in features.items() if isinstance(one, scalars)}
+    labels = {name: one for name, one in plain.items() if one.dtype.startswith(_LABEL_KINDS)}
     return column or images[0], labels
-
-
-def _count(rows: Any) -> int:
-    """The number of rows, 0 where it is not known without reading them."""
-    known = (rows.info.splits or {}).get(str(rows.split))
-    return getattr(rows, "num_rows", None) or getattr(known, "num_examples", None) or 0
 
 
 def _read_path(path: str, place: str | Path) -> bytes:
@@ -369,9 +361,8 @@ def _read_path(path: str, place: str | Path) -> bytes:
 
 def is_saved(folder: Path) -> bool:
     """Whether a folder was written by ``save_to_disk``."""
-    return (folder / "dataset_dict.json").is_file() or (
-        (folder / "state.json").is_file() and (folder / "dataset_info.json").is_file()
-    )
+    marks = ("dataset_dict.json",), ("state.json", "dataset_info.json")
+    return any(all((folder / name).is_file() for name in names) for names in marks)
 
 
 def _several_columns(source: str, what: str, columns: list[str]) -> ValueError:

@@ -73,8 +73,7 @@ class Check:
     good: str  # the finding as a clause where it is in order
     bad: str  # and where not
     advice: str  # what to do about it
-    # of a share (less is better) what is worth a note; None for what is better the larger it is
-    noted: float | None = None
+    noted: float | None = None  # of a share (less is better) what is worth a note; None: more is better
 
 
 CHECKS = {name: Check(**row) for name, row in table_beside(__file__, "checks.yaml").items()}  # by measure
@@ -183,8 +182,7 @@ class Examination:
     identical: int  # copies to the last pixel, the first of each not counted
     originals: measures.Originals | None  # sizes of the files, or None for a stream
     shared: Shared | None  # None where too few distinct images show anything
-    # rows of images by what they show ("most typical", "least typical", "one group", ...)
-    examples: Mapping[str, tuple[int, ...]]
+    examples: Mapping[str, tuple[int, ...]]  # rows of images by what they show ("most typical", "one group")
 
     @property
     def mean(self) -> Float[np.ndarray, "3 s s"] | None:

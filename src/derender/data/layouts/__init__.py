@@ -41,7 +41,7 @@ _READERS = {  # by name: whether a source looks like the layout, and the table o
     "synface_tracks": (rendered.is_tracks, rendered.load_tracks),
     "depth_pairs": (rendered.is_paired, rendered.load_pairs),
     "rafdb": (lambda source: faces.raf_list(source) is not None, faces.load_rafdb),
-    "celebamask": (faces.is_celebamask, faces.load_celebamask),
+    "celebamask": (lambda source: mostly(bool, faces.mask_names(source).values()), faces.load_celebamask),
     "celeba": (faces.is_celeba, faces.load_celeba),
     "utkface": (lambda source: mostly(faces.UTK_NAME.match, map(basename, source.images)), faces.load_utk),
     "yaleb": (lambda source: mostly(faces.YALE_NAME.match, map(basename, source.images)), faces.load_yale),

@@ -185,8 +185,7 @@ class _OwnersList(NamedTuple):
 
     def numbers(self, columns: Sequence[str], names: Sequence[str]) -> Float32[np.ndarray, "n c"]:
         """These columns for the images of these names, NaN for one without a row."""
-        missing = [column for column in columns if column not in self.columns]
-        if missing:
+        if missing := [column for column in columns if column not in self.columns]:
             known = ", ".join(self.columns) or "unnamed"
             raise ValueError(f"{self.where} has no column {missing[0]!r}; its columns are {known}")
         places = [self.columns.index(column) for column in columns]
@@ -202,8 +201,7 @@ def _owners_list(
     source: Source, stem: str, codes: Sequence[str] = (), meaning: str = ""
 ) -> _OwnersList | None:
     """The list of that name, as the original text or as a CSV copy, or None when neither is there."""
-    file = source.named(f"{stem}.txt", f"{stem}.csv")
-    if file is None:
+    if (file := source.named(f"{stem}.txt", f"{stem}.csv")) is None:
         return None
     where = f"{file} in {source.path}"
     comma = "," if file.endswith(".csv") else None
@@ -224,17 +222,14 @@ def _owners_list(
         if line:
             rows[name] = values
     if counted and len(rows) < int(lines[0]):
-        raise ValueError(
-            f"{where} is cut short: its first line says {int(lines[0]):,} rows and it has "
-            f"{len(rows):,}; copy it again, or correct that line"
-        )
+        what = f"its first line says {int(lines[0]):,} rows and it has {len(rows):,}"
+        raise ValueError(f"{where} is cut short: {what}; copy it again, or correct that line")
     return _OwnersList(where, columns, rows)
 
 
 def _attributes(source: Source, stem: str, names: Sequence[str]) -> Labels:
     """Every attribute as 1 yes, 0 no, -1 unknown (no row) for these images; none without the list."""
-    listed = _owners_list(source, stem, ("-1", "0", "1"), " of -1 or 1")
-    if listed is None:
+    if (listed := _owners_list(source, stem, ("-1", "0", "1"), " of -1 or 1")) is None:
         return {}
     rows = {name: np.array([value == "1" for value in row], np.int8) for name, row in listed.rows.items()}
     unknown = np.full(len(listed.columns), -1, np.int8)
@@ -292,10 +287,9 @@ def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.nd
     by_name = {basename(row["file"]): [row[column] for column in columns] for row in rows}
     listed = _OwnersList(f"{file} in {source.path}", columns, by_name)
     if missing := [name for name in names if name not in listed.rows]:
-        raise ValueError(
-            f"{listed.where} has no row for {missing[0]} ({len(missing):,} of {len(names):,} images have "
-            "none): add the rows, or move these images or the list out of the folder"
-        )
+        first = f"{missing[0]} ({len(missing):,} of {len(names):,} images have none)"
+        fix = "add the rows, or move these images or the list out of the folder"
+        raise ValueError(f"{listed.where} has no row for {first}: {fix}")
     boxes = listed.numbers(columns, names)
     if columns == _SIZED:
         boxes[:, 2:] += boxes[:, :2]
@@ -317,7 +311,7 @@ def parts_of(source: Source) -> dict[str, dict[int, str]]:
     return result
 
 
-def _mask_names(source: Source) -> dict[str, str]:
+def mask_names(source: Source) -> dict[str, str]:
     """By image its mask, "" where there is none: a file, or FOLDER/NUMBER_*.png for one in parts."""
     merged = {file for file in source.files if file.endswith(".png") and parent_name(file) == "masks"}
     in_parts = {int(basename(name).removesuffix("_*.png")): name for name in parts_of(source)}
@@ -330,14 +324,9 @@ def _mask_names(source: Source) -> dict[str, str]:
     return names
 
 
-def is_celebamask(source: Source) -> bool:
-    return layout.mostly(bool, _mask_names(source).values())
-
-
 def load_celebamask(source: Source) -> Table | None:
     """The label ``mask`` names each mask ("" for none); attributes and parts where their lists are there."""
-    masks = _mask_names(source)
-    if not any(masks.values()):
+    if not any((masks := mask_names(source)).values()):
         return None
     names = [basename(file) for file in masks]
     labels, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None

@@ -41,8 +41,7 @@ class Table:
 
     files: tuple[str, ...]  # images, as named by the source
     labels: Labels = field(default_factory=dict)  # columns by name, one value per file
-    # the owners' own split of each file ("train", "validation", "test"; "" unknown), or None
-    partition: np.ndarray | None = None
+    partition: np.ndarray | None = None  # the owners' split: "train", "validation", "test"; "" unknown
     # left, top, right, bottom, in pixels of the upright image, of the part that is read; None for whole
     # images. NaN: no box is known, and the image is passed over.
     boxes: Float32[np.ndarray, "n 4"] | None = None
@@ -68,22 +67,19 @@ class Layout:
     """One row of ``LAYOUTS``."""
 
     name: str  # what the user writes to ask for this layout
-    # whether a source looks like it, from the names of its files (and a header line)
-    recognise: Callable[[Source], bool]
+    recognise: Callable[[Source], bool]  # whether a source looks like it, by names of files (and a header)
     load: Callable[[Source], Table | None]  # every image with its labels; None where nothing is laid out so
     title: str  # what it is, in a few words
     expected: str = ""  # which files there must be, for messages
     home: str = ""  # where the owners publish it; "" for layouts without owners
     terms: str = ""  # on what terms the owners give it, in a few words; "" for layouts without owners
     split_from: str = ""  # the file that gives the official split, for messages
-    # the first of these that is there is read unless a part is asked for; () for all images
-    default_parts: Sequence[str] = ()
+    default_parts: Sequence[str] = ()  # unless a part is asked for, the first that is there; () for all
     fit: str = "crop"  # what becomes of images that are not square (data/image.py)
 
     def read(self, source: Source, subset: str | None = None) -> Table:
         """The images of one part: of the official split, else those in a folder of that name at any depth."""
-        table = self.load(source)
-        if table is None:
+        if (table := self.load(source)) is None:
             what = f"{source.path} cannot be read as {self.name} ({self.title})"
             owners = f"; its owners publish it at {self.home}" if self.home else ""
             raise ValueError(f"{what}: expected {self.expected}{owners}")
@@ -102,10 +98,8 @@ class Layout:
         if not inside:
             lacking = f"none ({self.split_from} is missing)" if self.split_from else "none"
             folders = sorted({file.partition("/")[0] for file in table.files if "/" in file})
-            raise ValueError(
-                f"{source.path} has no part {subset!r}: its parts are {', '.join(parts) or lacking}, "
-                f"its folders {', '.join(folders[:8]) or 'none'}"
-            )
+            there = f"{', '.join(parts) or lacking}, its folders {', '.join(folders[:8]) or 'none'}"
+            raise ValueError(f"{source.path} has no part {subset!r}: its parts are {there}")
         return table.select(np.array(inside))
 
 
@@ -211,8 +205,7 @@ def read_list(
 ) -> list[tuple[int, tuple[str, ...]]]:
     """The lines of a list, each as its number and the groups of the pattern ``row``; empty ones are left out.
 
-    A line that does not fit, or a first line that does not fit the pattern ``header``, is an error that says
-    what was ``expected``.
+    A line that fits neither that nor, as the first, the pattern ``header`` is an error with ``expected``.
     """
     rows = []
     for number, line in enumerate(map(str.strip, source.read_text(file).splitlines() or [""]), 1):

@@ -92,8 +92,7 @@ def _parameters(source: Source, folders: Sequence[str], files: Sequence[str]) ->
 
 def load_rendered(source: Source) -> Table | None:
     """The images beside every params.csv; their masks of parts, if they have such, as the label ``mask``."""
-    folders = rendered_folders(source)
-    if not folders:
+    if not (folders := rendered_folders(source)):
         return None
     beside = tuple(f"{folder}images/" for folder in folders)
     files = tuple(file for file in source.images if file.startswith(beside))
