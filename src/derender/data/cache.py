@@ -29,22 +29,16 @@ def cache_folder() -> Path:
     """``$DERENDER_CACHE``, or derender's folder in the place this system has for caches."""
     if "DERENDER_CACHE" in os.environ:
         return Path(os.environ["DERENDER_CACHE"])
-    if sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return base / "derender"
+    home = Path.home()
+    windows = os.environ.get("LOCALAPPDATA", home / "AppData" / "Local")
+    places = {"darwin": home / "Library" / "Caches", "win32": Path(windows)}
+    return places.get(sys.platform, Path(os.environ.get("XDG_CACHE_HOME", home / ".cache"))) / "derender"
 
 
 def read_cache(
     file: Path, fingerprint: str, image_size: int
 ) -> tuple[UInt8[np.ndarray, "n 3 s s"], dict[str, Any]] | None:
-    """The rows and the note, or None if there are none or they were made of something else.
-
-    The rows are a private memory map: writing to them changes no file.
-    """
+    """Rows, in memory that can be written and changes no file, and note; None: none, or of something else."""
     try:
         with file.open("rb") as stream:
             end = stream.seek(-len(_MARK) - 8, os.SEEK_END)
@@ -85,19 +79,16 @@ def write_cache(
                 written, storing = written + rows.nbytes, False
             storing = True
             stream.flush()
-            shape = (len((content := known())["files"]), 3, image_size, image_size)
-            checksum = sample_checksum(np.memmap(draft, np.uint8, mode="r", shape=shape))
-            note = {"fingerprint": fingerprint, "checksum": checksum, "content": content}
+            checksum = sample_checksum(np.memmap(draft, mode="r").reshape(-1, 3, image_size, image_size))
+            note = {"fingerprint": fingerprint, "checksum": checksum, "content": known()}
             encoded = json.dumps(note).encode()
             stream.write(encoded + len(encoded).to_bytes(8, "little") + _MARK)
     except OSError as problem:
         if not storing:  # the images could not be read
             raise
-        raise OSError(
-            f"cannot keep {written / 1e9:.3g} GB of decoded images in {file.parent} "
-            f"({problem.strerror or problem}); "
-            "set DERENDER_CACHE to a folder on another disk, or ask for smaller images"
-        ) from problem
+        what = f"cannot keep {written / 1e9:.3g} GB of decoded images in {file.parent}"
+        fix = "set DERENDER_CACHE to a folder on another disk, or ask for smaller images"
+        raise OSError(f"{what} ({problem.strerror or problem}); {fix}") from problem
 
 
 def sample_checksum(rows: np.ndarray) -> int:

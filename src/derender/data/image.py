@@ -39,13 +39,11 @@ from derender.storage.places import nearest_sibling, require_known
 
 GivenImages: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor | Sequence[Any]
 
-READER_VERSION = 1
-"""Goes up whenever the same file would decode to other pixels, so that cached images are made again."""
+READER_VERSION = 1  # goes up where a file would decode to other pixels: cached images are made again
 
 FITS = ("crop", "pad", "stretch", "room")  # what becomes of an image that is not square
 ROOM = 31 / 24  # a tight crop of a face, 84 x 96, becomes 124 x 124
-PIXEL_LIMIT = 170_000_000
-"""Images with more pixels are refused before a pixel is decoded (Pillow itself refuses at 179 million)."""
+PIXEL_LIMIT = 170_000_000  # above it nothing is decoded (Pillow itself refuses images at 179 million)
 
 _LARGE_PIXELS, _MOST_BYTES_A_PIXEL = 20_000_000, 24
 LARGE_BYTES, HEAD_BYTES = 64 << 20, 1 << 16
@@ -138,11 +136,8 @@ def _opened(encoded: bytes, pixel_limit: int) -> Iterator[Image.Image]:
 
 
 def refuse_by_header(head: bytes, size: int) -> None:
-    """Raise ``Unreadable`` where the first bytes of an image of ``size`` bytes show that it is not usable.
-
-    TIFF files may keep their header at the end, and are not judged.
-    """
-    if head[:4] not in (b"II*\0", b"MM\0*"):
+    """Raise ``Unreadable`` where the first bytes of an image of ``size`` bytes show that it is not usable."""
+    if head[:4] not in (b"II*\0", b"MM\0*"):  # TIFF files may keep their header at the end
         with _opened(head, PIXEL_LIMIT) as opened:
             if size > LARGE_BYTES + _MOST_BYTES_A_PIXEL * opened.width * opened.height:
                 raise Unreadable(f"{size >> 20:,} MiB of {opened.width} x {opened.height} pixels")
@@ -150,9 +145,8 @@ def refuse_by_header(head: bytes, size: int) -> None:
 
 def upright_rgb(opened: Image.Image) -> Image.Image:
     """An opened image of any of Pillow's modes as 8-bit RGB, turned as its EXIF orientation says."""
-    image = opened
-    if image.mode == "F" or image.mode.startswith("I"):
-        image = _from_high_depth(image)
+    deep = opened.mode == "F" or opened.mode.startswith("I")
+    image = _from_high_depth(opened) if deep else opened
     if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
         layered = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", layered.size, (*_BACKGROUND, 255)), layered)

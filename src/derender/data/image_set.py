@@ -31,6 +31,8 @@ from derender.data.source import Skipped
 from derender.data.stream import Decoded, Progress, Stream, column_of, decoded, estimated_total, kinds_of
 from derender.storage.places import counted, require_known, suggestion
 
+MEMORY_LIMIT_BYTES = 2 << 30  # larger sets (175,000 images of 64 x 64) lie in a memory-mapped file
+
 
 @dataclass(frozen=True)
 class Split:
@@ -57,9 +59,8 @@ def split_indices(
     if groups is not None:
         if len(groups) != len(names):
             raise ValueError(f"expected one group for each of {len(names)} images, got {len(groups)}")
-        alone = [str(group) in ("", "nan") for group in groups]
-        rows = zip(names, groups, alone, strict=True)
-        keys = [f"file {name}" if single else f"group {group}" for name, group, single in rows]
+        rows = zip(names, groups, strict=True)
+        keys = [f"file {name}" if str(one) in ("", "nan") else f"group {one}" for name, one in rows]
     salted = (f"{seed}\0{key}".encode("utf-8", "surrogateescape") for key in keys)
     digests = [hashlib.sha256(one).hexdigest() for one in salted]
     exact = len(names) * np.array(fractions)
@@ -71,10 +72,6 @@ def split_indices(
     cuts = [int(np.abs(ends - end).argmin()) for end in np.cumsum(counts)[:2]]
     part = np.searchsorted(cuts, group, side="right")
     return Split(*(np.flatnonzero(part == place) for place in range(3)))
-
-
-MEMORY_LIMIT_BYTES = 2 << 30
-"""Sets larger than this (175,000 images of 64 x 64) lie in a memory-mapped file instead of memory."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +111,7 @@ class ImageSet:
     def __post_init__(self) -> None:
         if self.images.dtype != np.uint8:
             raise ValueError(f"images must be bytes (uint8) of 0..255, got {self.images.dtype}: convert them")
-        columns = {"files": self.files, "partition": self.partition, **self.labels}
-        for name, column in columns.items():
+        for name, column in {"files": self.files, "partition": self.partition, **self.labels}.items():
             if column is not None and len(column) != len(self.images):
                 raise ValueError(f"{len(self.images)} images, but {len(column)} values in {name!r}")
 
@@ -139,10 +135,9 @@ class ImageSet:
     def label(self, name: str) -> np.ndarray:
         """One column of labels; an unknown name is an error that names those there are."""
         if name not in self.labels:
+            near = suggestion(name, self.labels)
             known = f"it has {', '.join(self.labels)}" if self.labels else "it has no labels"
-            raise ValueError(
-                f"{self.source} ({self.layout}) has no label {name!r}{suggestion(name, self.labels)}; {known}"
-            )
+            raise ValueError(f"{self.source} ({self.layout}) has no label {name!r}{near}; {known}")
         return self.labels[name]
 
     def require(self, minimum: int, purpose: str = "training") -> "ImageSet":
@@ -151,10 +146,8 @@ class ImageSet:
             result = "only one image was" if len(self) == 1 else f"only {len(self)} images were"
             left_out = len(self.skipped) + len(self.duplicates)
             note = f" ({left_out} more were unreadable or identical copies)" if left_out else ""
-            raise ValueError(
-                f"{purpose} needs {minimum:,} images or more, and {result} found "
-                f"in {self.source}{note}; add images"
-            )
+            needs = f"{purpose} needs {minimum:,} images or more"
+            raise ValueError(f"{needs}, and {result} found in {self.source}{note}; add images")
         return self
 
     def describe(self) -> str:

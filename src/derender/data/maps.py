@@ -34,7 +34,6 @@ from derender.data.stream import Progress, usable_cores
 from derender.storage.bounded import read_bounded
 
 CLASSES_FILE = "classes.txt"
-MOST_CLASSES = 255  # 255 itself marks pixels without a class in many sets
 DEPTH_RANGE = (0.9, 1.1)
 
 
@@ -78,9 +77,8 @@ def read_masks(
     Args:
         masks: a folder or zip with a mask for every image: that of ``a/b.jpg`` is ``a/b.png``, or the only
             ``b.png`` there is. A file ``classes.txt`` among them, or beside their folder as `derender synth`
-            writes it, names the classes. It has one a line, the first being number 0. Without it classes are
-            called after their numbers. None takes the data set's own masks, with CelebAMask-HQ's classes and
-            the aspect ratio of their images.
+            writes it, names the classes, one a line from number 0 on; else they have their numbers. None
+            takes the data set's own masks, with CelebAMask-HQ's classes and the aspect ratio of their images.
     """
     own = masks is None
     with ExitStack() as opened:
@@ -94,7 +92,7 @@ def read_masks(
             expected = "images/NAME.jpg with masks/NAME.png, or CelebA-HQ-img with CelebAMask-HQ-mask-anno"
             read_as = f"it was read as {stream.layout}"
             raise ValueError(f"{stream.source} holds no masks ({read_as}): expected {expected}")
-        classes = len(MASK_CLASSES) if own else MOST_CLASSES
+        classes = len(MASK_CLASSES) if own else 255  # which marks pixels without a class in many sets
         named = f"0 ({MASK_CLASSES[0]}) to {classes - 1} ({MASK_CLASSES[-1]})"
         limits = named if own else f"0 to {classes - 1}: give pixels without a class a class of their own"
         images = read_images(stream, image_size, fit=fit, workers=workers, progress=progress, **reading)
@@ -143,8 +141,7 @@ def read_ground_truth(
         layout = replace(layout, default_parts=("test_gt", "test", "train"))
         table = half_of(layout.read(opened, subset or named), half_named(source, options))
         if pairs:
-            chosen = table.at_most(limit).files
-            return _read_pairs(opened, {file: pairs[file] for file in chosen}, image_size)
+            return _read_pairs(opened, {file: pairs[file] for file in table.at_most(limit).files}, image_size)
         return _read_maps(opened, table, limit)
 
 
@@ -245,18 +242,13 @@ def _read_maps(source: Source, table: Table, limit: int | None) -> GroundTruth:
         normal = normal.astype(np.float32) / 255 * 2 - 1
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
         normal *= mask[..., None]
+    if albedo is not None:
+        albedo = _channels_first(albedo).astype(np.float32) / 255
+    images, depth = _channels_first(images), np.where(code > 0, 0.8 + code / 65535 * 0.4, 0)
     camera, light = (np.stack([table.labels[name] for name in names], axis=1) for names in (CAMERA, LIGHT))
-    return GroundTruth(
-        images=_channels_first(images),
-        depth=np.where(code > 0, 0.8 + code / 65535 * 0.4, 0).astype(np.float32),
-        normal=normal,
-        albedo=None if albedo is None else _channels_first(albedo).astype(np.float32) / 255,
-        mask=mask,
-        light=light,
-        camera=np.pad(camera, ((0, 0), (0, 1))),
-        files=table.files,
-        labels={name: one for name, one in table.labels.items() if name not in (*LIGHT, *CAMERA, "mask")},
-    )
+    labels = {name: one for name, one in table.labels.items() if name not in (*LIGHT, *CAMERA, "mask")}
+    result = images, depth.astype(np.float32), normal, albedo, mask, light, np.pad(camera, ((0, 0), (0, 1)))
+    return GroundTruth(*result, table.files, labels)
 
 
 def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -> GroundTruth:
@@ -280,8 +272,7 @@ def _read_pairs(source: Source, pairs: dict[str, str], image_size: int | None) -
 
 
 def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarray, "h w"]:
-    """One depth map, z with 0 for background; at ``size`` if given, shrunk by area over the object's pixels.
-    A pixel is on the object where more than half of it is."""
+    """One depth map, z with 0 for background; at ``size`` if given, by area over the object's pixels."""
     opened = _opened(source, file)
     mode, code = opened.mode, np.asarray(opened)
     if mode == "RGB" and (code == code[..., :1]).all():
@@ -296,7 +287,7 @@ def _read_depth(source: Source, file: str, size: int | None) -> Float32[np.ndarr
         return depth
     whole = [Image.fromarray(one.astype(np.float32)) for one in (depth, mask)]
     by_area, share = (np.asarray(one.resize((size, size), Image.Resampling.BOX)) for one in whole)
-    small = share > 0.5
+    small = share > 0.5  # a pixel is on the object where more than half of it is
     return np.where(small, by_area / np.where(small, share, 1), 0).astype(np.float32)
 
 

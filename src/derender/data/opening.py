@@ -1,9 +1,8 @@
 """From what the user wrote to a stream of images.
 
 A path may be followed by ``::PART``: a part of the official split or any folder. Streams (shards, and data
-sets of Hugging Face's library) are read from front to back. They take ``?column=NAME`` (also ``config``,
-``revision``) before ``::PART``; others take ``?half=test`` or ``?half=development``. A path that exists is
-always a path.
+sets of Hugging Face's library) are read from front to back. They take ``?column=NAME`` (``config``,
+``revision``) before ``::PART``; others ``?half=test`` or ``?half=development``. What exists is a path.
 """
 
 import hashlib
@@ -23,10 +22,8 @@ from derender.data.stream import Sample, Stream
 from derender.data.streamed import SHARD_SUFFIXES, HuggingFaceStream, ShardStream, find_shards, is_saved
 from derender.storage.places import SUFFIXES, hub_id, nearest_sibling, require_known
 
-STREAMED = ("webdataset", "huggingface")
-"""The layouts that are read from front to back, by the names one can ask for them."""
+STREAMED = ("webdataset", "huggingface")  # layouts that are read from front to back, as one asks for them
 
-_OPTIONS = ("column", "config", "revision", "half")
 _ENTRIES_LOOKED_AT = 10_000
 
 
@@ -160,7 +157,7 @@ def parse_source(source: str | Path, subset: str | None = None) -> tuple[str, st
         return left, part, {}
     options = dict(parse_qsl(query, keep_blank_values=True))
     for name in options:
-        require_known(f"option of {text}", name, _OPTIONS)
+        require_known(f"option of {text}", name, ("column", "config", "revision", "half"))
     return place, part, options
 
 

@@ -35,11 +35,17 @@ from derender.data.image import DECODER_ERRORS, HEAD_BYTES, LARGE_BYTES, Unreada
 from derender.storage.bounded import FILE_LIMIT_BYTES, read_bounded
 from derender.storage.places import SUFFIXES
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
 _HEADER_BYTES = 30
-_ENCRYPTED = 1
 _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _HIDDEN = re.compile(r"(^|/)(\.(?!\.?(/|$))|__MACOSX(/|$))|/$|^$")
 _UNSAFE = re.compile(r"^/|^[^/]*:|(^|/)\.\.(/|$)")
+
+ALWAYS_ALLOWED_BYTES = 512 * 2**20
+MOST_EXPANSION = 1000  # files of equal features expand hundreds of times, those of real ones not ten times
 
 
 @dataclass(frozen=True)
@@ -165,10 +171,7 @@ class FolderSource(FileSource):
 
 
 class ZipSource(Source):
-    """The members of a zip that are neither hidden, unsafe, encrypted nor packed in a way of their own.
-
-    Of two with one name the later.
-    """
+    """The members of a zip that are not hidden, unsafe, encrypted or packed in a way of their own."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -185,12 +188,12 @@ class ZipSource(Source):
                 continue
             if _UNSAFE.search(file):
                 faults.add((file, "unsafe name in the zip (absolute or with ..)"))
-            elif member.flag_bits & _ENCRYPTED:
+            elif member.flag_bits & 1:
                 faults.add((file, "encrypted in the zip"))
             elif member.compress_type not in _PACKINGS:
                 faults.add((file, "packed by bzip2, LZMA or the like: pack the zip by deflate, as usual"))
             else:
-                self._members[file] = member
+                self._members[file] = member  # of two with one name the later
         self.files = tuple(sorted(self._members))
         self.skipped = tuple(Skipped(*fault) for fault in sorted(faults))
         begins = sorted({member.header_offset for member in self._archive.infolist()})
@@ -260,15 +263,6 @@ def is_hidden(name: str) -> bool:
 def printable(name: str) -> str:
     """The name with bytes that are not UTF-8 as backslash escapes, so that it can be stored anywhere."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-ALWAYS_ALLOWED_BYTES = 512 * 2**20
-MOST_EXPANSION = 1000
-"""Of features that are all the same some files expand hundreds of times, of real ones not ten times."""
 
 
 def opened_parquet(file: Path | bytes) -> "pq.ParquetFile":

@@ -24,7 +24,8 @@ from derender.data.layouts.layout import Table, text_column
 from derender.data.source import Closing, Skipped
 
 Value = str | int | float | bool | None  # one label of one image; None is unknown
-_EXACT_IN_FLOAT32 = 1 << 24
+Progress = Callable[[int, int], object]  # called with (done, total), from the calling thread
+CHUNK = 32  # images that one thread decodes before it hands them on
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,7 @@ class Sample:
     """One image on its way."""
 
     file: str  # its name, unique in the stream
-    # gives its encoded bytes, or raises ValueError or OSError with the reason; any thread may call it, once
-    read: Callable[[], bytes]
+    read: Callable[[], bytes]  # its bytes, or ValueError or OSError with why not; any thread calls it, once
     share: float | None = None  # how much of the stream lies before the next sample, 0..1; None: unknown
     labels: Mapping[str, Value] = field(default_factory=dict)  # by column; one that is not here is unknown
     partition: str = ""  # the owners' own split ("train", "validation", "test"), or ""
@@ -66,13 +66,9 @@ class Stream(Closing, ABC):
         return str(Path(self.source).absolute())
 
 
-def unreadable(reason: str) -> Callable[[], bytes]:
-    """A ``Sample.read`` of an image that is known to be no use."""
-
-    def refuse() -> bytes:
-        raise ValueError(reason)
-
-    return refuse
+def unreadable(reason: str) -> bytes:
+    """With its reason given, the ``Sample.read`` of an image that is known to be no use."""
+    raise ValueError(reason)
 
 
 def kinds_of(rows: Iterable[Mapping[str, Value]]) -> dict[str, str | None]:
@@ -86,7 +82,7 @@ def kinds_of(rows: Iterable[Mapping[str, Value]]) -> dict[str, str | None]:
         if isinstance(value, bool):
             kind = "flag"
         elif value is not None:
-            large = isinstance(value, str) or (isinstance(value, int) and abs(value) > _EXACT_IN_FLOAT32)
+            large = isinstance(value, str) or (isinstance(value, int) and abs(value) > 2**24)
             kind = "text" if large else "number"
         kinds[name] = kind if known is None else known if kind in (None, known) else "text"
     return kinds
@@ -99,11 +95,6 @@ def column_of(values: Iterable[Value], kind: str | None) -> np.ndarray:
     if kind == "flag":
         return np.array([-1 if value is None else int(value) for value in values], np.int8)
     return text_column("" if value is None else str(value) for value in values)
-
-
-Progress = Callable[[int, int], object]  # called with (done, total), from the calling thread
-CHUNK = 32  # images that one thread decodes before it hands them on
-DIGEST_BYTES = 16
 
 
 class Decoded(NamedTuple):
@@ -126,8 +117,7 @@ def usable_cores() -> int:
 def decoded(
     stream: Stream, image_size: int, *, fit: str = "crop", start: int = 0, workers: int | None = None
 ) -> Generator[list[Decoded]]:
-    """Decode a stream from sample ``start`` on, up to its limit, some at a time; close it to end its threads.
-    Wrap in ``quiet_pillow``."""
+    """Decode from ``start`` to the stream's limit, in chunks, in ``quiet_pillow``; closing ends threads."""
     cores = workers or usable_cores()
     samples = islice(stream.samples(start), None if stream.limit is None else max(0, stream.limit - start))
     waiting: deque[Future[list[Decoded]]] = deque()
@@ -155,7 +145,7 @@ def decode_samples(start: int, samples: Iterable[Sample], image_size: int, fit: 
                     raise Unreadable("empty file")
                 pixels = decode(encoded, image_size, sample.fit if fit == "crop" else fit, sample.box)
                 del encoded
-            outcome = hashlib.blake2b(pixels.data, digest_size=DIGEST_BYTES).digest()
+            outcome = hashlib.blake2b(pixels.data, digest_size=16).digest()
         except ValueError as problem:
             outcome = Unreadable(str(problem))
         except OSError as problem:

@@ -31,10 +31,10 @@ from derender.data.stream import Sample, Stream, Value, unreadable
 from derender.storage.bounded import FILE_LIMIT_BYTES, read_bounded
 from derender.storage.places import optional, suggestion
 
-SHARD_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
-"""File names that end in one of these are taken for shards."""
+SHARD_SUFFIXES = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")  # ends of the names of shards
 
 _LABELS = ("json", "cls")
+_LABEL_KINDS = ("string", "large_string", "int", "uint", "float", "bool")  # types of Hugging Face's columns
 _BLOCK = 512
 _DAMAGE = (tarfile.TarError, OSError, EOFError, zlib.error, lzma.LZMAError, ValueError, OverflowError)
 _MOST_SHARDS = 1_000_000
@@ -132,20 +132,17 @@ class ShardStream(Stream):
             fault = f"{missing} in this sample (it has {', '.join(group.content)})"
         partition = partition_named(_series(shard))
         if fault:
-            return Sample(name, unreadable(fault), share, partition=partition)
+            return Sample(name, partial(unreadable, fault), share, partition=partition)
         read, labels = partial(bytes, group.content[images[0]] or b""), {}
         try:
             labels = _labels(group.content)
         except ValueError as problem:
-            read = unreadable(str(problem))
+            read = partial(unreadable, str(problem))
         return Sample(f"{name}.{images[0]}", read, share, labels, partition)
 
 
 def find_shards(path: Path, source: str, part: str | None = None) -> list[Path]:
-    """The shards below a folder, sorted by path; a shard itself; or those of a pattern with braces.
-
-    Of a part ``train`` are those called train-000.tar, and those in a folder of that name.
-    """
+    """Shards of a part below a folder, sorted by path; a shard itself; or those of a pattern with braces."""
     if path.is_dir():
         result = (one for one in path.rglob("*") if one.name.endswith(SHARD_SUFFIXES) and one.is_file())
         if not (shards := sorted(result)):
@@ -205,10 +202,6 @@ def _labels(content: Mapping[str, bytes | None]) -> dict[str, Value]:
     return labels
 
 
-_ANSWER_SECONDS = 10.0
-_LABEL_KINDS = ("string", "large_string", "int", "uint", "float", "bool")
-
-
 class HuggingFaceStream(Stream):
     """The rows of one split, or of all ("all"), of a folder, .parquet file or id "owner/name".
 
@@ -223,8 +216,7 @@ class HuggingFaceStream(Stream):
         config: str | None = None, revision: str | None = None,
     ):  # fmt: skip
         datasets = optional("datasets", f"reading {source} as a Hugging Face data set", "huggingface")
-        self.source = source
-        self._where = place
+        self.source, self._where = source, place
         self._options = (split, column, config)
         self._revision = revision if isinstance(place, Path) else _commit(place, revision)
         splits = _load(source, place, config, self._revision)
@@ -273,10 +265,7 @@ class HuggingFaceStream(Stream):
         name = f"{split}/{row:08d}"
         if path:
             name += f"-{printable(PurePosixPath(path.replace(os.sep, '/')).name)}"
-        if content is not None:
-            read = partial(bytes, content)
-        else:
-            read = partial(_read_path, path, self._where) if path else unreadable("no image in this row")
+        read = partial(_read_path, path, self._where) if content is None else partial(bytes, content)
         labels = {}
         for column, feature in self._labels.items():
             value, names = values[column], getattr(feature, "names", None)
@@ -291,7 +280,7 @@ def _commit(identifier: str, revision: str | None) -> str:
     from huggingface_hub import HfApi, errors
 
     try:
-        return HfApi().dataset_info(identifier, revision=revision, timeout=_ANSWER_SECONDS).sha or "main"
+        return HfApi().dataset_info(identifier, revision=revision, timeout=10.0).sha or "main"
     except Exception as problem:  # what a broken connection raises changes with the client's HTTP library
         hub = "the Hugging Face Hub"
         fault = f"{hub} cannot be asked for {identifier} ({type(problem).__name__}): check the network"
@@ -344,8 +333,10 @@ def _columns(rows: Any, column: str | None, source: str) -> tuple[str, dict[str,
     return column or images[0], labels
 
 
-def _read_path(path: str, place: str | Path) -> bytes:
+def _read_path(path: str | None, place: str | Path) -> bytes:
     """An image that the row only points at: on the Hub, or inside the local data set; never elsewhere."""
+    if not path:
+        raise ValueError("no image in this row")
     if "://" in path:
         import fsspec
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from derender.data.doctor import measures
-from derender.data.doctor.measures import JackknifeEstimate
+from derender.data.doctor.measures import JackknifeEstimate, jackknife
 from derender.data.image_set import ImageSet, read_images
 from derender.data.opening import ListedStream, open_images
 from derender.data.source import evenly_spaced, is_image
@@ -26,6 +26,12 @@ Level = Literal["good", "note", "trouble", "objection", "open"]
 
 AXIS_OFFSET = 0.06  # an axis of symmetry farther from the middle than this share of the width is off it
 AXIS_SYMMETRIC = 0.7  # both sides about an axis correlate by this much where it is one
+
+EXAMINED_PX = 64  # side at which images are read for an examination
+COMPARED = 4_000  # most distinct images that are compared with one another, evenly spaced
+FEWEST_COMPARED = 2 * measures.GROUPS  # with fewer distinct images nothing can be said about what they share
+ODD_LIKENESS = 0.15  # an image less like the others than this is unlike all of them
+SHOWN = 8  # images in each row of examples, at most
 
 
 @dataclass(frozen=True)
@@ -153,13 +159,6 @@ def percent(share: float) -> str:
     return "over 99 %" if 0.99 < share < 1 else f"{100 * share:.0f} %"
 
 
-EXAMINED_PX = 64  # side at which images are read for an examination
-COMPARED = 4_000  # most distinct images that are compared with one another, evenly spaced
-FEWEST_COMPARED = 2 * measures.GROUPS  # with fewer distinct images nothing can be said about what they share
-ODD_LIKENESS = 0.15  # an image less like the others than this is unlike all of them
-SHOWN = 8  # images in each row of examples, at most
-
-
 @dataclass(frozen=True)
 class Shared:
     """What distinct images share."""
@@ -233,10 +232,9 @@ def doctor(
     """
     originals = None
     if not isinstance(images, ImageSet):
-        source = images
-        if Path(source).is_file() and is_image(str(source)):
-            raise ValueError(f"{source} is one image: a set is examined as a whole, give its folder or zip")
-        with open_images(source, dataset=dataset, limit=limit) as stream:
+        if Path(images).is_file() and is_image(str(images)):
+            raise ValueError(f"{images} is one image: a set is examined as a whole, give its folder or zip")
+        with open_images(images, dataset=dataset, limit=limit) as stream:
             images = read_images(stream, EXAMINED_PX, keep_duplicates=True, progress=progress)
             if isinstance(stream, ListedStream):
                 originals = measures.measure_originals(stream.files, images.files, EXAMINED_PX)
@@ -293,9 +291,8 @@ def _compare(images: ImageSet, rows: np.ndarray, generator: np.random.Generator)
     odd = float((alike < ODD_LIKENESS).mean())
     of_edges = {"agreement": measures.agreement, "symmetry": measures.symmetry}
     of_edges |= {"fill": measures.frame_filled, "view": measures.view_variety}
-    error_of = measures.jackknife
-    values = {name: error_of(lambda kept, of=of: of(edges[kept]), count) for name, of in of_edges.items()}
-    values["light"] = error_of(lambda kept: measures.light_variety(sides[kept]), count)
+    values = {name: jackknife(lambda kept, of=of: of(edges[kept]), count) for name, of in of_edges.items()}
+    values["light"] = jackknife(lambda kept: measures.light_variety(sides[kept]), count)
     values["odd"] = JackknifeEstimate(odd, float(np.sqrt(odd * (1 - odd) / count)))
     orders = {
         ("least typical", "most typical"): alike,

@@ -25,8 +25,7 @@ from derender.data.image import DECODER_ERRORS, quiet_pillow, upright_size
 from derender.data.source import Source, evenly_spaced
 from derender.data.stream import Progress
 
-GREY_PX, TINY_PX = 32, 16
-"""Sides of the grey images that structure is measured on, and that near copies are detected in."""
+GREY_PX, TINY_PX = 32, 16  # sides of the grey images that show structure, and near copies
 
 DARK, BRIGHT = 2, 253  # at or beyond these values of 255 a channel counts as clipped
 COPY_CORRELATION = 0.98  # tiny grey images that correlate by this much or more are near copies
@@ -126,11 +125,10 @@ def near_copy_groups(tiny: Float32[np.ndarray, "n d"]) -> Int64[np.ndarray, " n"
     leading principal components, in which none are farther apart than in full. Groups are connected pairs.
     Leaves out colour, mirrored copies, and copies cropped otherwise.
     """
-    group = np.arange(len(tiny))
     sample = tiny[evenly_spaced(len(tiny), _SAMPLE)]
     covariance = np.cov(sample, rowvar=False) if len(sample) > 1 else np.eye(tiny.shape[1])
     places = (tiny @ np.linalg.eigh(covariance)[1][:, -_COMPONENTS:]).astype(np.float32)
-    standing = group.copy()
+    group = standing = np.arange(len(tiny))
     while len(standing) > 1:
         merged = standing[_merged(tiny[standing], places[standing])]
         if (merged == standing).all():
@@ -246,13 +244,10 @@ def _to_others(structure: Cells) -> float:
 
 
 def frame_filled(structure: Cells) -> float:
-    """Share of the image that the mean structure covers, 0..1: (sum of energy)^2 / (cells x sum of squares).
-
-    The energy that chance puts into a mean of so few images is taken off first.
-    """
+    """Share of the image covered by mean structure, 0..1: (sum of energy)^2 / (cells x sum of squares)."""
     mean = structure.mean(axis=0, dtype=np.float64)
     chance = ((structure**2).mean(axis=(0, 3)) - (mean**2).mean(axis=2)) / (len(structure) - 1)
-    energy = np.clip((mean**2).mean(axis=2) - chance, 0, None)
+    energy = np.clip((mean**2).mean(axis=2) - chance, 0, None)  # less that of so few images
     return float(energy.sum() ** 2 / max(CELLS**2 * float((energy**2).sum()), 1e-18))
 
 

@@ -33,16 +33,12 @@ _UTK_OLDEST = 116
 
 YALE_NAME = re.compile(r"(?P<identity>yaleB\d+)_(?P<pose>P\d\d)A(?P<a>[+-]\d+)E(?P<e>[+-]\d+)\.\w+")
 LFW_NAME = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P=identity)_\d{4}\.\w+")
-_LFW_PARTS = {"peopleDevTrain.txt": "train", "peopleDevTest.txt": "test"}
 
 _RAF_LISTS = ("list_patition_label.txt", "list_partition_label.txt")
-EMOTIONS = ("surprise", "fear", "disgust", "happiness", "sadness", "anger", "neutral")
-"""In the owners' order: 1 is surprise, 7 neutral."""
+EMOTIONS = ("surprise", "fear", "disgust", "happiness", "sadness", "anger", "neutral")  # the owners' 1 to 7
 
 _TRACKS_HEADER = "CVHCI_TRACKLABELS_V1"
-_NUMBERED = re.compile(
-    r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>(?:track[_-]?)?\d+)/(?:frame[_-]?)?\d[\d._-]*\.\w+"
-)
+_NUMBERED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?:track[_-]?)?\d+/(?:frame[_-]?)?\d[\d._-]*\.\w+")
 _NESTED = re.compile(r"(?:.*/)?(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+")
 
 
@@ -76,7 +72,7 @@ def load_lfw(source: Source) -> Table | None:
     if not all("/" in file for file in files):
         return None
     part_of_person: dict[str, str] = {}
-    for name, part in _LFW_PARTS.items():
+    for name, part in (("peopleDevTrain.txt", "train"), ("peopleDevTest.txt", "test")):
         if (file := source.named(name)) is not None:
             expected = "the number of people, then a name and a number of images a line"
             rows = read_list(source, file, r"(.+?)\s+\d+", expected, header=r"\d+")
@@ -161,12 +157,11 @@ def _listed_tracks(source: Source, lists: dict[str, str]) -> Labels:
     return dict(zip(("identity", "track", "episode", "frame"), columns, strict=True))
 
 
-MASK_CLASSES = (
+MASK_CLASSES = (  # the owners' names by class number: eye_g are glasses, ear_r earrings, neck_l a necklace
     *("background", "skin", "nose", "eye_g", "l_eye", "r_eye", "l_brow", "r_brow", "l_ear", "r_ear"),
     *("mouth", "u_lip", "l_lip", "hair", "hat", "ear_r", "neck_l", "neck", "cloth"),
 )
-"""The owners' names in their order, which is the class number: eye_g are glasses, ear_r earrings, neck_l a
-necklace."""
+_PART = re.compile(rf"(?:(.*)/)?(\d+)_({'|'.join(MASK_CLASSES[1:])})\.png", re.DOTALL)
 
 BOX_LIST = "boxes.csv"
 
@@ -175,7 +170,6 @@ _IN_ORDER = np.array(["", *_PARTITIONS.values()])  # the parts are runs of image
 _FIRST_NUMBERS = (1, 162_771, 182_638)
 _POINTS = [f"{name}_{axis}" for name in ("lefteye", "righteye", "leftmouth", "rightmouth") for axis in "xy"]
 _SIZED, _SIDES = ("left", "top", "width", "height"), ("left", "top", "right", "bottom")
-_MAPPING = "CelebA-HQ-to-CelebA-mapping.txt"
 
 
 class _OwnersList(NamedTuple):
@@ -300,14 +294,10 @@ def _own_boxes(source: Source, file: str, names: Sequence[str]) -> Float32[np.nd
 
 def parts_of(source: Source) -> dict[str, dict[int, str]]:
     """The files of every mask in parts, by class number, under the mask's name (FOLDER/NUMBER_*.png)."""
-    numbers = {name: number for number, name in enumerate(MASK_CLASSES) if number}
     result: dict[str, dict[int, str]] = {}
-    for file in source.files:
-        if file.endswith(".png"):
-            folder, _, name = file.rpartition("/")
-            digits, _, part = name.removesuffix(".png").partition("_")
-            if part in numbers and digits.isdecimal():
-                result.setdefault(f"{folder}/{digits}_*.png", {})[numbers[part]] = file
+    for match in filter(None, map(_PART.fullmatch, source.files)):
+        folder, digits, part = match.groups(default="")
+        result.setdefault(f"{folder}/{digits}_*.png", {})[MASK_CLASSES.index(part)] = match[0]
     return result
 
 
@@ -330,7 +320,7 @@ def load_celebamask(source: Source) -> Table | None:
         return None
     names = [basename(file) for file in masks]
     labels, partition = _attributes(source, "CelebAMask-HQ-attribute-anno", names), None
-    if (mapping := source.named(_MAPPING)) is not None:
+    if (mapping := source.named("CelebA-HQ-to-CelebA-mapping.txt")) is not None:
         expected, header = "idx orig_idx orig_file, as in 0 119613 119614.jpg", r"idx\s+orig_idx\s+orig_file"
         rows = read_list(source, mapping, r"(\d+)\s+\S+\s+(\d+)(?:\.\w+)?", expected, header)
         origins = {f"{int(number)}.jpg": int(origin) for _, (number, origin) in rows}

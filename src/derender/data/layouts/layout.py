@@ -21,18 +21,15 @@ from derender.storage.places import require_known
 
 Labels = dict[str, np.ndarray]
 
-PARTITION_NAMES = {
+PARTITION_NAMES = {  # what people call the parts of a split, and what they are called here
     **dict.fromkeys(("train", "training"), "train"),
     **dict.fromkeys(("val", "valid", "validation", "dev"), "validation"),
     **dict.fromkeys(("test", "testing", "eval"), "test"),
 }
-"""What people call the parts of a split, and what they are called here."""
 
-TOLD = table_beside(__file__, "layouts.yaml")
-"""What is told of each layout, by its name."""
+TOLD = table_beside(__file__, "layouts.yaml")  # what is told of each layout, by its name
 
-_MOSTLY = 0.9
-"""Share of the images that must look right for a layout to be recognised: real sets hold a few odd names."""
+_MOSTLY = 0.9  # of the images must look right for a layout to be recognised: real sets hold a few odd names
 
 
 @dataclass(frozen=True)
@@ -42,9 +39,8 @@ class Table:
     files: tuple[str, ...]  # images, as named by the source
     labels: Labels = field(default_factory=dict)  # columns by name, one value per file
     partition: np.ndarray | None = None  # the owners' split: "train", "validation", "test"; "" unknown
-    # left, top, right, bottom, in pixels of the upright image, of the part that is read; None for whole
-    # images. NaN: no box is known, and the image is passed over.
-    boxes: Float32[np.ndarray, "n 4"] | None = None
+    # of the parts that are read, left, top, right, bottom in pixels, upright; NaN: unknown, and passed over
+    boxes: Float32[np.ndarray, "n 4"] | None = None  # None: whole images
     skipped: tuple[Skipped, ...] = ()  # images that a user's own list names and that are not there
 
     def select(self, rows: np.ndarray) -> "Table":
@@ -103,8 +99,6 @@ class Layout:
         return table.select(np.array(inside))
 
 
-HALVES = ("all", "development", "test")
-HALVED_BY = ("identity", "model")
 T = TypeVar("T", bound=Any)
 
 
@@ -118,11 +112,11 @@ def half_of(rows: T, half: str) -> T:
     Raises:
         ValueError: another half, or one that is empty.
     """
-    require_known("half", half, HALVES)
+    require_known("half", half, ("all", "development", "test"))
     if half == "all":
         return rows
     keys = list(map(stem_of, rows.files))
-    owner = next((name for name in HALVED_BY if name in rows.labels), None)
+    owner = next((name for name in ("identity", "model") if name in rows.labels), None)
     if owner is not None:
         owners = zip(rows.labels[owner].tolist(), keys, strict=True)
         keys = [key if value in ("", None) else str(value) for value, key in owners]
@@ -178,8 +172,7 @@ def read_csv(source: Source, file: str, required: Sequence[str] = ()) -> list[Ma
     where = f"{file} in {source.path}"
     reader = csv.DictReader(io.StringIO(source.read_text(file), newline=""))
     try:
-        header = [name.strip() for name in reader.fieldnames or ()]
-        reader.fieldnames = header
+        reader.fieldnames = header = [name.strip() for name in reader.fieldnames or ()]
         rows = [(reader.line_num, row) for row in reader]
     except csv.Error as problem:
         raise ValueError(f"{where} is no CSV table ({problem})") from problem

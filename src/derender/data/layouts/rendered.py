@@ -28,8 +28,7 @@ _TRACK = re.compile(r"(?:.*/)?tracks/(?P<identity>[^/]+)/(?P<track>[^/]+)/[^/]+\
 
 _ID = re.compile(r"(?<![0-9a-f])[0-9a-f]{24,32}(?![0-9a-f])")
 _CARS = "02958343"
-_PUBLISHED_SIZE = (128, 128)
-_CROP = (14, 8, 114, 108)  # left, top, right, bottom
+_CROP = (14, 8, 114, 108)  # of the published 128 x 128: left, top, right, bottom
 _MAPS = {"depth", "mask", "normal", "albedo"}  # folders of maps beside images, as unsup3d's faces have
 _TABLES = (f"{_CARS}.csv", "metadata.csv", "all.csv")
 
@@ -163,7 +162,7 @@ def load_cars(source: Source) -> Table | None:
         results = [known.get(model, ("", "")) for model in models]
         labels["name"], labels["class"] = map(text_column, zip(*results, strict=True))
     try:  # the published crop for every image if the first one has the published size
-        published = bool(files) and upright_size(source.read(files[0])) == _PUBLISHED_SIZE
+        published = upright_size(source.read(files[0])) == (128, 128)
     except DECODER_ERRORS:
         published = False
     boxes = np.tile(np.array(_CROP, np.float32), (len(files), 1)) if published else None

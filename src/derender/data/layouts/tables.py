@@ -33,9 +33,8 @@ class TableSource(FileSource):
         super().__init__(path)
         self.table = path.name
         _, paths, _ = _columns(self, self.table)
-        there = (file for file in paths if is_image(file))
-        there = [file for file in there if os.path.isfile(self.on_disk(file))]  # noqa: PTH113  (or too long)
-        self.files = tuple(sorted({self.table, *there}))
+        there = [file for file in filter(is_image, paths) if os.path.isfile(self.on_disk(file))]  # noqa: PTH113
+        self.files = tuple(sorted({self.table, *there}))  # Path.is_file raises where a path is too long
 
 
 def holds_paths(path: Path) -> bool:
@@ -146,10 +145,8 @@ def _cells(source: Source, file: str) -> dict[str, list[str]]:
         raise ValueError(f"{where} is damaged ({problem}): restore it") from problem
     if nested := _not_cells(table.schema):
         column = table.schema.field(nested[0])
-        raise ValueError(
-            f"column {column.name!r} of {where} holds {column.type}; expected paths, numbers and text "
-            "(images kept inside a table are not read)"
-        )
+        expected = "expected paths, numbers and text (images kept inside a table are not read)"
+        raise ValueError(f"column {column.name!r} of {where} holds {column.type}; {expected}")
     cells = {name: table[name].to_pylist() for name in table.column_names}
     return {name: ["" if one is None or one != one else str(one) for one in cells[name]] for name in cells}
 
