@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from derender.data import ImageSet
-from derender.report.evidence import Subject, gather, suitable_label
-from derender.report.run import loss_charts, run_page
+from derender.report.run import Subject, gather, loss_charts, run_page, suitable_label
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run
 

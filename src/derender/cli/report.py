@@ -24,8 +24,7 @@ def report(
 
     The page holds images of the data: share it as you would the data itself.
     """
-    from derender.report.evidence import Evidence, run_evidence
-    from derender.report.run import run_page
+    from derender.report.run import Evidence, run_evidence, run_page
 
     if not (run / "config.yaml").is_file():
         raise FileNotFoundError(f"no run in {run} (no config.yaml): give a folder made by derender train")

@@ -23,9 +23,8 @@ from derender.model import Derenderer
 from derender.presets import MODEL_PRESETS
 from derender.report import colours
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
-from derender.report.evidence import looping_films
 from derender.report.page import DIRECTIONS, Page
-from derender.report.run import loss_charts
+from derender.report.run import looping_films, loss_charts
 from derender.report.viewer.images import rendered_examples
 from derender.scene.normals import normals_from_depth
 from derender.training.config import PRESETS

@@ -30,9 +30,8 @@ from derender.model import Derenderer, load
 from derender.photo import find_faces, open_photograph
 from derender.postprocess.fitting import STEPS
 from derender.report.colours import image_bytes
-from derender.report.evidence import run_evidence
 from derender.report.page import Page
-from derender.report.run import run_page
+from derender.report.run import run_evidence, run_page
 from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
 from derender.training.task import Progress, TrainResult

@@ -122,8 +122,7 @@ def train(
     result = (derender_task.train if ours else train_baseline)(config, images, out, **how)
     leave()
     if page and this_rank_writes():
-        from derender.report.evidence import Evidence, look_at_data
-        from derender.report.run import run_page
+        from derender.report.run import Evidence, look_at_data, run_page
 
         run_page(out, Evidence({"data": look_at_data(images)})).write(out / "report.html")
     return result
