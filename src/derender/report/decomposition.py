@@ -20,10 +20,10 @@ from torch import Tensor
 
 from derender.data import as_float
 from derender.model import Derenderer
-from derender.renderers import Renderer
 from derender.report import colours
 from derender.report.opening import OpenedImage
 from derender.report.panel import labelled_grid
+from derender.report.sweeps import drawn
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.scene.normals import normals_from_depth
@@ -63,7 +63,7 @@ class Decomposition:
 
     def write(self, folder: Path, record: Mapping[str, Any]) -> dict[str, Any]:
         """Write the first image's files; returns the content of its scene.json."""
-        scene = self.scene[0].detach()
+        scene = self.scene[0]
         named = {
             row.name: dict(zip((one.name for one in row.numbers), values, strict=True))
             for row in self.model.factors
@@ -72,20 +72,16 @@ class Decomposition:
         }
         ambient, diffuse, pitch, yaw = scene.light[0].tolist()
         *rotation, x, y, z = scene.camera[0].tolist()
-        angles = {"pitch_deg": degrees(pitch), "yaw_deg": degrees(yaw)}
-        written = {
-            **record,
-            "light": {"ambient": ambient, "diffuse": diffuse, **angles},
-            "camera": {"rotation_deg": [*map(degrees, rotation)], "translation": [x, y, z]},
-            **named,
-        }
+        light = {"ambient": ambient, "diffuse": diffuse, "pitch_deg": degrees(pitch), "yaw_deg": degrees(yaw)}
+        camera = {"rotation_deg": [*map(degrees, rotation)], "translation": [x, y, z]}
+        written = {**record, "light": light, "camera": camera, **named}
         labelled_grid({name: [image] for name, image in self.row.items()}).save(folder / "panel.png")
         for name, image in self.row.items():
             image.convert("RGBA").save(folder / f"{name.replace(' ', '_')}.png")
         text = json.dumps(written, indent=1, ensure_ascii=False)
         (folder / "scene.json").write_text(text, encoding="utf-8", errors="backslashreplace")
-        values: dict[str, Any] = {name: value[0].cpu().numpy() for name, value in scene.parameters.items()}
-        values["normal"] = normals_from_depth(scene.depth, self.model.fov_deg)[0].cpu().numpy()
+        values: dict[str, Any] = {name: value[0].numpy() for name, value in scene.parameters.items()}
+        values["normal"] = normals_from_depth(scene.depth, self.model.fov_deg)[0].numpy()
         np.savez_compressed(folder / "scene.npz", **values)
         return written
 
@@ -100,27 +96,25 @@ def decomposition(
 
     ``depth_range`` is the nearest and farthest depth of the colour scale; by default that of these scenes.
     """
-    scene, renderer = scene.detach(), model.renderer
-    shown = (scene, under_another_light(scene), from_another_view(scene))
-    with torch.no_grad():
-        own, relit, rotated = map(model.render, shown)
+    scene = scene.detach()
     columns = {
         "input": colours.pictures(images),
-        "reconstruction": colours.pictures(own.image, own.mask),
-        **factor_images(scene, renderer, model.fov_deg, depth_range),
-        "another light": colours.pictures(relit.image, relit.mask),
-        "another view": colours.pictures(rotated.image, rotated.mask),
+        "reconstruction": drawn(scene, model.render),
+        **factor_images(scene, model, depth_range),
+        "another light": drawn(under_another_light(scene), model.render),
+        "another view": drawn(from_another_view(scene), model.render),
     }
-    columns |= {title: columns.pop(title) for title in renderer.maps}  # the renderer's own come last
-    further = {name: drawn for name, value in scene.extra.items() if (drawn := colours.any_maps(value))}
+    columns |= {title: columns.pop(title) for title in model.renderer.maps}  # the renderer's own come last
+    further = {name: maps for name, value in scene.extra.items() if (maps := colours.any_maps(value))}
     return Decomposition({**columns, **further}, scene.to("cpu"), model)
 
 
 @torch.no_grad()
 def factor_images(
-    scene: Scene, renderer: Renderer, fov_deg: float, depth_range: tuple[float, float] | None = None
+    scene: Scene, model: Derenderer, depth_range: tuple[float, float] | None = None
 ) -> dict[str, colours.Images]:
     """Depth, normals, albedo and shading of scenes, then what the renderer itself shows, by column name."""
+    renderer, fov_deg = model.renderer, model.fov_deg
     return {
         "depth": colours.depth_maps(scene.depth, limits=depth_range),
         "normals": colours.normal_maps(normals_from_depth(scene.depth, fov_deg)),

@@ -27,25 +27,16 @@ from derender.scene import Scene
 from derender.scene.enlarge import at_size
 from derender.storage.atomic import DamageNoticed
 from derender.storage.places import model_folder
-from derender.training.held_out_errors import (
-    LEAST_EXPLAINED,
-    HeldOutErrors,
-    explained_variance,
-    read_errors,
-    reconstruction_percentile,
-)
+from derender.training import held_out_errors as errors
+from derender.training.held_out_errors import HeldOutErrors
 
 UNSUITABLE_PERCENTILE = 95.0
-"""Up to it, and from ``LEAST_EXPLAINED`` on, an image is drawn in which no face is found.
-
-Most generated heads are, few other objects.
-"""
+"""Up to it, and from ``LEAST_EXPLAINED`` on, images without a face are drawn: most generated heads are."""
 
 T = TypeVar("T")
 Read = tuple[np.ndarray, Frame, dict[str, Any], np.ndarray]
-"""Pixels (3, S, S) at the model's size, the part of the file that they show, that part as JSON has it.
-
-Last the pixels by which the image is judged: no search by their error chose them."""
+"""Pixels (3, S, S) at the model's size, the part of the file that they show, that part as JSON has it, and
+pixels by which the image is judged: no search by their error chose those."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +74,6 @@ class ImageOpener:
     """Opens images with a model.
 
     Args:
-        model: trained.
-        options: how images are read and drawn.
         default_size: side of the output where ``options`` names none; never below the model's.
         default_detail: "photo" or "model", where ``options`` names none.
         whole: draw whole photographs, unless the options say otherwise.
@@ -134,12 +123,12 @@ class ImageOpener:
         faceless = [path for path in doubts if read[path][2]["found"] != "profile"]
         if faceless and self.held_out is not None:
             judged = np.stack([read[path][-1] for path in faceless])
-            percentiles = reconstruction_percentile(self.model, judged, self.held_out)
-            shares = explained_variance(self.model, judged)
+            percentiles = errors.reconstruction_percentile(self.model, judged, self.held_out)
+            shares = errors.explained_variance(self.model, judged)
             for path, worse, share in zip(faceless, percentiles, shares, strict=True):
                 doubts[path] += f"; reconstructed worse than {worse:.0f} % of the validation images"
                 doubts[path] += f", with {100 * max(0, share):.0f} % of its variance explained"
-                if worse <= UNSUITABLE_PERCENTILE and share >= LEAST_EXPLAINED:
+                if worse <= UNSUITABLE_PERCENTILE and share >= errors.LEAST_EXPLAINED:
                     del doubts[path]
         return doubts
 
@@ -155,7 +144,7 @@ class ImageOpener:
         percentiles: Sequence[float | None] = [None] * len(scenes)
         if self.held_out is not None:
             judged = np.stack([middle for _, _, _, middle in read.values()])
-            percentiles = reconstruction_percentile(self.model, judged, self.held_out).tolist()
+            percentiles = errors.reconstruction_percentile(self.model, judged, self.held_out).tolist()
         rows = zip(read.items(), scenes, percentiles, strict=True)
         return [
             OpenedImage(path, pixels, frame, framing, scene, self.model.render, percentile, limits)
@@ -216,7 +205,7 @@ def readable(
 def held_out_errors(source: str | Path) -> HeldOutErrors | None:
     """The reconstruction errors stored with a model; None, with a warning, where they are damaged."""
     try:
-        return read_errors(model_folder(source))
+        return errors.read_errors(model_folder(source))
     except (ValueError, OSError) as problem:
         warnings.warn(f"cannot find out-of-distribution images: {problem}", DamageNoticed, stacklevel=2)
         return None

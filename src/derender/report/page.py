@@ -31,6 +31,7 @@ TEMPLATES = Environment(
     keep_trailing_newline=True,
     undefined=StrictUndefined,
 )
+IMAGE_TYPES = {b"\x89PNG": "image/png", b"GIF8": "image/gif", b"\xff\xd8\xff": "image/jpeg"}
 DIRECTIONS = {"high": "higher is better", "low": "lower is better", None: ""}
 
 
@@ -61,11 +62,10 @@ class Page:
 def data_uri(source: Image.Image | bytes) -> str:
     """An image, or the bytes of a PNG, GIF or JPEG file, as a page holds it."""
     content = source if isinstance(source, bytes) else png_bytes(source)
-    kinds = {b"\x89PNG": "png", b"GIF8": "gif", b"\xff\xd8\xff": "jpeg"}
-    kind = next((name for start, name in kinds.items() if content.startswith(start)), None)
-    if kind is None:
-        raise ValueError("a page takes PNG, GIF or JPEG bytes; these are none of them")
-    return f"data:image/{kind};base64,{b64encode(content).decode()}"
+    for start, kind in IMAGE_TYPES.items():
+        if content.startswith(start):
+            return f"data:{kind};base64,{b64encode(content).decode()}"
+    raise ValueError("a page takes PNG, GIF or JPEG bytes; these are none of them")
 
 
 def html_cells(scores: ScoreTable, row: Any) -> list[tuple[str, dict[str, str]]]:

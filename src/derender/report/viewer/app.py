@@ -25,21 +25,10 @@ from derender.features import FeatureTable
 from derender.model import Derenderer
 from derender.photo import editing_steps
 from derender.report.opening import held_out_errors, readable
+from derender.report.page import IMAGE_TYPES
+from derender.report.viewer import questions
 from derender.report.viewer.images import KEPT, Example, Gallery, Shelf, rendered_examples
-from derender.report.viewer.questions import (
-    BODY_LIMIT_BYTES,
-    LARGEST_SIZE,
-    PIXEL_LIMIT,
-    CropRequest,
-    FilmRequest,
-    NeighbourRequest,
-    Question,
-    Refused,
-    ViewRequest,
-    photo_of,
-    read_request,
-    too_large,
-)
+from derender.report.viewer.questions import BODY_LIMIT_BYTES, Question, Refused, ViewRequest, too_large
 from derender.report.viewer.server import Guard
 from derender.report.viewer.studio import Studio
 
@@ -51,10 +40,8 @@ REQUEST_LIMIT_BYTES = 10_000
 DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
 """So much of a body that is too large is still read and dropped, so that browsers see the answer."""
 
-MEDIA_TYPES = {
-    b"\x89PNG": "image/png", b"\xff\xd8": "image/jpeg", b"GIF8": "image/gif", b"glTF": "model/gltf-binary",
-    b"PK": "application/zip", b"{": "application/json",
-}  # fmt: skip
+FILE_TYPES = {b"glTF": "model/gltf-binary", b"PK": "application/zip", b"{": "application/json"}
+MEDIA_TYPES = IMAGE_TYPES | FILE_TYPES
 PAGE_FILES = {"index.html": "html", "view.css": "css", "view.js": "javascript", "surface.js": "javascript"}
 
 
@@ -82,11 +69,9 @@ def open_viewer(
     """
     if fit_steps:
         model.features.required_fitting(source)
-    gallery = None
-    if table is not None:
-        if not set(table.factors) & set(model.nets):
-            raise ValueError(f"the table has none of the factors of {source}: make it anew by derender embed")
-        gallery = Gallery(table, data, dataset)
+    if table is not None and not set(table.factors) & set(model.nets):
+        raise ValueError(f"the table has none of the factors of {source}: make it anew by derender embed")
+    gallery = None if table is None else Gallery(table, data, dataset)
     read, problems = readable(images, read_photo)
     notes = [f"left out {path}: {reason}" for path, reason in problems.items()]
     if gallery is not None and gallery.without_pictures:
@@ -106,11 +91,7 @@ class Application:
     """
 
     def __init__(
-        self,
-        studio: Studio,
-        host: str = "127.0.0.1",
-        body_seconds: float = 30.0,
-        work_seconds: float = 30.0,
+        self, studio: Studio, host: str = "127.0.0.1", body_seconds: float = 30.0, work_seconds: float = 30.0
     ):
         self.studio = studio
         self.body_seconds, self.work_seconds = body_seconds, work_seconds
@@ -121,8 +102,8 @@ class Application:
             "/api/examples/{number:int}": self.open_example,
             "/api/rows/{number:int}": self.open_row,
             "/api/neighbours": self.neighbours,
-            "/api/crop": partial(self.made, studio.again, CropRequest, patience=LONG_WORK),
-            "/api/film": partial(self.made, studio.film, FilmRequest, patience=LONG_WORK),
+            "/api/crop": partial(self.made, studio.again, questions.CropRequest, patience=LONG_WORK),
+            "/api/film": partial(self.made, studio.film, questions.FilmRequest, patience=LONG_WORK),
         }
         makers = ("view", "before", "preview", "picture", "panel", "mesh", "archive", "factors", "settings")
         posts |= {f"/api/{name}": partial(self.made, getattr(studio, name), ViewRequest) for name in makers}
@@ -145,13 +126,13 @@ class Application:
 
     async def about(self, request: Request) -> Response:
         """All that the page needs to draw itself."""
-        limits = {"body_limit_bytes": BODY_LIMIT_BYTES, "pixel_limit": PIXEL_LIMIT}
+        limits = {"body_limit_bytes": BODY_LIMIT_BYTES, "pixel_limit": questions.PIXEL_LIMIT}
         return JSONResponse({"derender": __version__, **limits, **self.studio.about()})
 
     async def open_upload(self, request: Request) -> Response:
         """Decompose the image in the body."""
         content = await self._receive(request, BODY_LIMIT_BYTES)
-        return await self._opened(await self._work(self._decoding, photo_of, content))
+        return await self._opened(await self._work(self._decoding, questions.photo_of, content))
 
     async def open_example(self, request: Request) -> Response:
         """Decompose one of the examples."""
@@ -163,13 +144,13 @@ class Application:
     async def open_row(self, request: Request) -> Response:
         """Decompose the image of one row of the table."""
         gallery, number = self.studio.searched(), request.path_params["number"]
-        sizes = (LARGEST_SIZE, self.studio.model.image_size)
+        sizes = (questions.LARGEST_SIZE, self.studio.model.image_size)
         photo, pixels = [await self._work(self._decoding, gallery.picture, number, size) for size in sizes]
         return await self._opened(photo.transpose(1, 2, 0), pixels)
 
     async def neighbours(self, request: Request) -> Response:
         """The rows nearest to an image by one factor, with their images where those are here."""
-        question = await self._question(request, NeighbourRequest)
+        question = await self._question(request, questions.NeighbourRequest)
         rows, gallery = [], self.studio.searched()
         for row, distance in await self._work(self._computing, self.studio.neighbours, question):
             shown = await self._work(self._decoding, gallery.shown, row)
@@ -201,7 +182,7 @@ class Application:
             raise Refused(503, "this took too long: try again, or with fewer --fit-steps") from late
 
     async def _question(self, request: Request, kind: type[Question]) -> Question:
-        return read_request(kind, await self._receive(request, REQUEST_LIMIT_BYTES))
+        return questions.read_request(kind, await self._receive(request, REQUEST_LIMIT_BYTES))
 
     async def _receive(self, request: Request, limit: int) -> bytes:
         """The body of a request; ``Refused`` if it is too large (413) or too slow (408)."""

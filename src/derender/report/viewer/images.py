@@ -31,9 +31,7 @@ from derender.report.page import data_uri
 from derender.report.viewer.questions import Refused, pixels_of
 from derender.scene import Scene
 
-KEPT = 64
-KEPT_BYTES = 400_000_000
-"""Of photographs together."""
+KEPT, KEPT_BYTES = 64, 400_000_000  # opened images, and bytes of their photographs together
 ROWS = {
     **dict.fromkeys(("faces-64", "faces-128"), "portraits.webp"),
     "rendered-faces-64": "faces.png",
@@ -75,9 +73,7 @@ class Shelf:
         """Store an image; returns its name."""
         name = secrets.token_urlsafe(16)
         self._images[name] = image
-        while len(self._images) > self.limit or (
-            len(self._images) > 2 and self._kept_bytes() > self.limit_bytes
-        ):
+        while len(self._images) > (self.limit if self._kept_bytes() <= self.limit_bytes else 2):
             self._images.popitem(last=False)
         return name
 
@@ -111,9 +107,8 @@ def rendered_examples(model: str, image_size: int | None = None) -> list[Example
     content = files("derender.report.viewer").joinpath(ROWS[model]).read_bytes()
     with Image.open(BytesIO(content)) as row:
         side = image_size or row.height
-        pixels = np.array(
-            row.convert("RGB").resize((side * row.width // row.height, side), Image.Resampling.LANCZOS)
-        )
+        size = (side * row.width // row.height, side)
+        pixels = np.array(row.convert("RGB").resize(size, Image.Resampling.LANCZOS))
     tiles = np.split(pixels, pixels.shape[1] // side, axis=1)
     return [Example(f"example {number}", tile) for number, tile in enumerate(tiles, 1)]
 
@@ -126,8 +121,7 @@ class Gallery:
     """
 
     def __init__(self, table: FeatureTable, source: str | None = None, dataset: str = "auto"):
-        self.table = table
-        self.without_pictures = ""
+        self.table, self.without_pictures = table, ""
         self._listed: ListedStream | None = None
         place = source if source is not None else str(table.origin.get("data", ""))
         try:

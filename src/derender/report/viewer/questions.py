@@ -38,8 +38,7 @@ class Refused(Exception):
 
     def __init__(self, status: int, message: str):
         super().__init__(message)
-        self.status = status
-        self.message = message
+        self.status, self.message = status, message
 
 
 class Light(Settings):
@@ -172,7 +171,5 @@ def _decoded(encoded: bytes, decoder: Callable[[], np.ndarray]) -> np.ndarray:
         if "million pixels" in str(problem) or isinstance(problem.__cause__, DecompressionBombError):
             most = f"{PIXEL_LIMIT // 10**6} million pixels"
             raise Refused(413, f"this image has more than {most}: make it smaller first") from problem
-        reason = " ".join(str(problem).split())[:200]
-        raise Refused(
-            415, f"this file cannot be read: {reason}; whatever its name, choose an image ({KINDS})"
-        ) from problem
+        reason = f"this file cannot be read: {' '.join(str(problem).split())[:200]}"
+        raise Refused(415, f"{reason}; whatever its name, choose an image ({KINDS})") from problem

@@ -25,14 +25,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 if TYPE_CHECKING:
     from derender.report.viewer.app import Application
 
-HOST = re.compile(r"(?:\[([^]]+)\]|([^:\[]+))(?::[0-9]*)?")
-"""``name``, ``name:port``, ``[v6]`` or ``[v6]:port``."""
+HOST = re.compile(r"(?:\[([^]]+)\]|([^:\[]+))(?::[0-9]*)?")  # name, name:port, [v6] or [v6]:port
 OWN_HEADER = "x-derender-page"
 SECURITY_HEADERS = {
     "content-security-policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
-        "img-src 'self' data: blob:; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data: "
+        "blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     ),
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
@@ -59,12 +57,10 @@ class Guard:
                 MutableHeaders(scope=message).update(SECURITY_HEADERS)
             await send(message)
 
-        refusal = self.refusal(scope["method"], scope["path"], Headers(scope=scope))
-        if refusal is None:
-            await self.app(scope, receive, send_guarded)
-            return
-        status, reason = refusal
-        answer = JSONResponse({"error": reason}, status, headers={"connection": "close"})
+        answer = self.app
+        if refusal := self.refusal(scope["method"], scope["path"], Headers(scope=scope)):
+            status, reason = refusal
+            answer = JSONResponse({"error": reason}, status, headers={"connection": "close"})
         await answer(scope, receive, send_guarded)
 
     def refusal(self, method: str, path: str, headers: Headers) -> tuple[int, str] | None:
@@ -97,12 +93,9 @@ def allowed_host(header: str, bound: str) -> bool:
     if (match := HOST.fullmatch(header)) is None:
         return False
     name = (match[1] or match[2]).lower().rstrip(".")
-    if name == "localhost":
-        return True
-    address = _address(name)
-    if is_loopback(bound):
-        return address is not None and address.is_loopback
-    return address is not None or name in {bound.lower(), socket.gethostname().lower()}
+    if is_loopback(name) or is_loopback(bound):
+        return is_loopback(name)
+    return _address(name) is not None or name in {bound.lower(), socket.gethostname().lower()}
 
 
 def is_loopback(host: str) -> bool:
@@ -152,22 +145,11 @@ def address_of(listener: socket.socket, host: str) -> str:
 
 def server_for(application: "Application") -> uvicorn.Server:
     """uvicorn with these bounds."""
-    logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
     config = uvicorn.Config(
-        application.guarded,
-        http="h11",
-        ws="none",
-        lifespan="off",
-        log_config=None,
-        log_level="error",
-        access_log=False,
-        server_header=False,
-        proxy_headers=False,
-        timeout_keep_alive=30,
-        timeout_graceful_shutdown=1,
-        limit_concurrency=256,
-        h11_max_incomplete_event_size=16_384,
-    )
+        application.guarded, http="h11", ws="none", lifespan="off", log_config=None, log_level="error",
+        server_header=False, proxy_headers=False, timeout_keep_alive=30, timeout_graceful_shutdown=1,
+        limit_concurrency=256, h11_max_incomplete_event_size=16_384,
+    )  # fmt: skip
     return uvicorn.Server(config)
 
 

@@ -36,28 +36,14 @@ from derender.report.colours import image_bytes
 from derender.report.decomposition import factor_images
 from derender.report.mesh import model_mesh
 from derender.report.panel import labelled_grid
-from derender.report.sweeps import FILMS, circling_light, swapped, swaying_view
+from derender.report.sweeps import FILMS, circling_light, drawn, swapped, swaying_view
+from derender.report.viewer import questions
 from derender.report.viewer.images import Example, Gallery, Shelf, ShownImage, data_url
-from derender.report.viewer.questions import (
-    FARTHEST,
-    Camera,
-    CropRequest,
-    FilmRequest,
-    Light,
-    NeighbourRequest,
-    Place,
-    Refused,
-    ViewRequest,
-)
+from derender.report.viewer.questions import Camera, Light, Refused, ViewRequest
 from derender.scene import Scene
 from derender.scene.enlarge import at_size
-from derender.training.held_out_errors import (
-    OUTLIER_PERCENTILE,
-    HeldOutErrors,
-    masked_l1,
-    percentile_of,
-    reconstruction_errors,
-)
+from derender.training import held_out_errors
+from derender.training.held_out_errors import OUTLIER_PERCENTILE, HeldOutErrors, percentile_of
 
 PHOTOGRAPHS_KEPT = 6  # ready to be drawn
 LARGEST_PHOTO = 4096
@@ -104,7 +90,7 @@ class Studio:
             "numbers": {row.name: [asdict(one) for one in row.numbers] for row in rows if row.numbers},
             "maps": list(self.model.renderer.maps),
             "rotation_deg": ranges.rotation_deg,
-            "translation": [min(reach, FARTHEST) for reach in reaches],
+            "translation": [min(reach, questions.FARTHEST) for reach in reaches],
             "kept": self.shelf.limit,
         }
 
@@ -124,13 +110,13 @@ class Studio:
         frame, framed = self._found(photo, faces, self.frame if pixels is None else "none")
         return self._decomposed(photo, faces, frame, framed, self.fit_steps, pixels)
 
-    def again(self, question: CropRequest) -> dict[str, Any]:
+    def again(self, question: questions.CropRequest) -> dict[str, Any]:
         """An opened image decomposed again: another crop, or its scene optimised; returns as `open` does."""
         opened, crop = self.shelf.get(question.picture), question.crop
         if question.fit and self.model.fitting is None:
             raise ValueError("fit: this model cannot optimise scenes per image; ask without it")
         frame, framed, (height, width) = opened.frame, opened.framed, opened.photo.shape[:2]
-        if isinstance(crop, Place):
+        if isinstance(crop, questions.Place):
             side = min(crop.side, 2.0 * max(height, width))
             frame = Frame(min(crop.x, width), min(crop.y, height), side, crop.roll_deg).snapped()
             framed = "own"
@@ -156,10 +142,10 @@ class Studio:
         with torch.inference_mode():
             images = as_float(pixels[None]).to(self.model.device)
             features = {name: rows[0] for name, rows in factor_codes(self.model, images).items()}
-            errors = reconstruction_errors(self.model, pixels[None])
+            errors = held_out_errors.reconstruction_errors(self.model, pixels[None])
             if fit_steps:
                 scene = self.model.fit_scenes(images, fit_steps).scene
-                l1 = float(masked_l1(self.model.render(scene), images)[0])
+                l1 = float(held_out_errors.masked_l1(self.model.render(scene), images)[0])
             else:
                 scene, l1 = self.model.decompose(images), float(errors[0])
         scene = scene.to("cpu")
@@ -224,13 +210,12 @@ class Studio:
             question = question.model_copy(update={"whole": True, "size": side})
         return image_bytes(self._drawn(question))
 
-    def film(self, question: FilmRequest) -> bytes:
+    def film(self, question: questions.FilmRequest) -> bytes:
         """GIF or MP4: the light circles, or the view goes from side to side."""
         question = question.model_copy(update={"size": min(self._size(question), FILM_SIZE)})
-        scene = self.scene(question)
         moves = {"light": (circling_light, FILM_LIGHT_DEG), "camera": (swaying_view, FILM_VIEW_DEG)}
         move, reach_deg = moves[question.move]
-        scenes = move(scene, FILM_FRAMES, reach_deg)
+        scenes = move(self.scene(question), FILM_FRAMES, reach_deg)
         frames = [self._drawn(question, scenes[number]) for number in range(len(scenes))]
         return FILMS[question.kind](frames, FILM_SECONDS)
 
@@ -239,12 +224,9 @@ class Studio:
         opened, size = self.shelf.get(question.picture), self._size(question)
         with torch.inference_mode():
             scene = at_size(self.scene(question), size)
-            factors = factor_images(scene, self.model.renderer, self.model.fov_deg)
-            return {
-                "input": colours.pictures(opened.pixels[None])[0],
-                "reconstruction": self._rendered(at_size(opened.scene, size)),
-                **{name: image for name, (image,) in factors.items()},
-            }
+            shown = {name: image for name, (image,) in factor_images(scene, self.model).items()}
+            own = self._rendered(opened.scene, size)
+            return {"input": colours.pictures(opened.pixels[None])[0], "reconstruction": own, **shown}
 
     def factors(self, question: ViewRequest) -> dict[str, str]:
         """The same as images inside JSON."""
@@ -259,8 +241,7 @@ class Studio:
         """A ZIP: the panel, every map, the image, the mesh, and the settings."""
         files = {f"{name}.png": image_bytes(image) for name, image in self.maps(question).items()}
         files |= {"panel.png": self.panel(question), "view.png": self.picture(question)}
-        files["surface.glb"] = self.mesh(question)
-        files["settings.json"] = self.settings(question)
+        files |= {"surface.glb": self.mesh(question), "settings.json": self.settings(question)}
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in files.items():
@@ -293,7 +274,7 @@ class Studio:
         }
         return (json.dumps(values, indent=1) + "\n").encode()
 
-    def neighbours(self, question: NeighbourRequest) -> list[tuple[int, float]]:
+    def neighbours(self, question: questions.NeighbourRequest) -> list[tuple[int, float]]:
         """Rows nearest by one factor of the image that gives it, and distances; without that image itself."""
         table = self.searched().table
         other = dict(question.swaps).get(question.factor, question.picture)  # type: ignore[call-overload]
@@ -316,7 +297,7 @@ class Studio:
         with torch.inference_mode():
             scene = self.scene(question) if scene is None else scene
             if question.detail == "model":
-                return self._rendered(at_size(scene, self._size(question)))
+                return self._rendered(scene, self._size(question))
             changed = {name: value for name, value in scene.parameters.items() if name != "albedo"}
             return Image.fromarray(self._shown(question).edited(**changed))
 
@@ -337,9 +318,8 @@ class Studio:
         place = Frame((frame.x - left) * scale, (frame.y - top) * scale, frame.side * scale, frame.roll_deg)
         return Photograph.of(pixels, place, opened.scene, self.model)
 
-    def _rendered(self, scene: Scene) -> Image.Image:
-        rendering = self.model.render(scene.to(self.model.device))
-        return colours.pictures(rendering.image, rendering.mask)[0]
+    def _rendered(self, scene: Scene, size: int) -> Image.Image:
+        return drawn(at_size(scene, size).to(self.model.device), self.model.render)[0]
 
 
 def _source(question: ViewRequest) -> str:
