@@ -14,11 +14,10 @@ from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation import cluster_shares, explain_labels, explanation, pair_parts
 from derender.report import charts
-from derender.report.doctor import doctor_page
 from derender.report.explanation import explanation_page, share_chart
 from derender.report.page import Page
 from derender.report.protocols import comparison_page
-from derender.report.run import run_page
+from derender.report.run import doctor_page, run_page
 from derender.training.config import resolve
 from derender.training.run_folder import append_metrics, start_run
 

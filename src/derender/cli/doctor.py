@@ -33,7 +33,7 @@ def doctor(
     output.result(f"verdict: {result.verdict.text}")
     values = result.as_json()
     if out is not None:
-        from derender.report.doctor import doctor_page
+        from derender.report.run import doctor_page
 
         values["report"] = doctor_page(result).write(out)
         output.result(f"report {out}")

@@ -8,6 +8,6 @@ mesh          a scene's surface for other programs
 options, opening, edits, editing  images opened, edited and written to disk
 charts        curves and bars as SVG; matrices
 page          one self-contained HTML file, made of templates/
-run, doctor, explanation, protocols  the pages
+run, explanation, protocols  the pages
 viewer/       the page one can play with, and its server
 """

@@ -2,7 +2,8 @@
 
 Given images, the page also has data, decompositions, films, scores, card and factors. Every part looks at few
 images, so that a page takes minutes; ``derender evaluate`` and ``derender explain`` measure with more. A part
-that cannot be made is listed with its reason.
+that cannot be made is listed with its reason. The doctor's findings are also a page by themselves. Both hold
+images of the set: share them as you would the set itself.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,13 +18,15 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from derender import __version__
 from derender.baselines import read_any_config
 from derender.data import GroundTruth, ImageSet, Progress, as_float, read_ground_truth, split_indices
-from derender.data.doctor import EXAMINED_PX, doctor
+from derender.data.doctor import CHECKS, EXAMINED_PX, Examination, doctor
 from derender.data.image import read_photo
 from derender.data.source import evenly_spaced
 from derender.evaluation.disentanglement import disentangle
 from derender.evaluation.pixels import evaluate_reconstruction, mean_image
+from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.evaluation.truth import evaluate_factors, evaluate_geometry
 from derender.inputs import as_images, as_model
 from derender.interpretation import explain
@@ -31,13 +34,13 @@ from derender.model import Derenderer
 from derender.overrides import settings_by_name
 from derender.report import charts, colours
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
-from derender.report.doctor import doctor_values
 from derender.report.explanation import share_chart, share_values
 from derender.report.opening import readable
 from derender.report.page import Page
-from derender.report.panel import labelled_grid
+from derender.report.panel import labelled_grid, strip
 from derender.report.sweeps import animated_png, relit_and_rotated
 from derender.storage.bounded import read_json
+from derender.storage.places import counted
 from derender.training.config import TrainConfig
 from derender.training.run_folder import RunFolder, read_metrics
 
@@ -228,6 +231,42 @@ def look_at_data(images: ImageSet) -> Values:
     sample = _sample(images, EXAMINED)
     size = f"All {len(sample):,} images" if len(sample) == len(images) else f"{len(sample):,} images"
     return {"source": images.describe(), "size": size, "found": doctor_values(doctor(sample))}
+
+
+def doctor_page(examination: Examination) -> Page:
+    """The whole page for one set of images."""
+    return Page(
+        "doctor.html",
+        "Does this set suit the method?",
+        f"{examination.images.describe()}. Examined without training anything.",
+        {"found": doctor_values(examination)},
+        f"derender {__version__}. This page holds images of the set: share it as you would the set itself.",
+    )
+
+
+def doctor_values(examination: Examination) -> dict[str, Any]:
+    """What ``templates/findings.html`` shows of an examination."""
+    images, mean = examination.images, examination.mean
+    mirrored = [] if mean is None else colours.pictures(np.stack([mean, mean[..., ::-1]]))
+    notes = {"value": "", "±": "two standard errors", "will struggle": "limit", "does not suit": "limit"}
+    rows = []
+    for name, check in CHECKS.items():
+        if (one := examination.values.get(name)) is not None:
+            cells = (one.value, 2 * one.error or None, check.struggles, check.objects)
+            rows.append(Row(check.label, cells, note=check.note))
+    compared = 0 if examination.shared is None else len(examination.shared.rows)
+    caption = f"{counted(len(images), 'images')}, {compared:,} distinct ones compared"
+    columns = [Column(name, None, 3, note) for name, note in notes.items()]
+    return {
+        "examination": examination,
+        "least": CHECKS["agreement"].struggles,
+        "mean": [colours.enlarged(image, 128) for image in mirrored],
+        "strips": {
+            title: strip(colours.pictures(images.images[list(some)]), gap=4)
+            for title, some in examination.examples.items()
+        },
+        "measures": ScoreTable(caption, "measure", columns, rows),
+    }
 
 
 def gather(subject: Subject, progress: Progress | None = None) -> Evidence:
