@@ -37,10 +37,8 @@ if TYPE_CHECKING:  # their imports take long
     from derender.report.mesh import Mesh
 
 FILM = "film.mp4"
-ROWS = ".sheet"
-"""Folder of the rows of a sheet, a file for each image, until the sheet is drawn."""
-NAMED = 5
-"""So many images that cannot be read are named."""
+ROWS = ".sheet"  # folder of the rows of a sheet, a file for each image, until the sheet is drawn
+NAMED = 5  # so many images that cannot be read are named
 
 Edited: TypeAlias = "Decomposition | Edit | Mesh"
 """What can be written for one image: ``write`` its files, and a ``row`` of the sheet over all images."""
@@ -128,7 +126,7 @@ def write_images(
         ValueError: no image can be read or suits the model, the edit is impossible, or another process writes
             to ``out``.
     """
-    files = image_files(paths, out)
+    files, how = image_files(paths, out), opener.options
     places, kept = _places(files, out), out / ROWS
     done = {file for file in files if resume and places[file].exists()}
     files = [file for file in files if file not in done]
@@ -137,33 +135,29 @@ def write_images(
     moving = [file for file in files if is_video(file)]
     if moving and video is None:
         raise ValueError(f"{moving[0]} is a video: relight, rotate or swap it")
-    unused = {"only_frame": opener.options.only_frame, "size": opener.options.size}
-    unused["detail=model"] = opener.detail == "model"
+    unused = {"only_frame": how.only_frame, "size": how.size, "detail=model": opener.detail == "model"}
     if moving and moving == files and (given := [name for name, value in unused.items() if value]):
         raise ValueError(f"{moving[0]} is a video, which is drawn whole: leave out {', '.join(given)}")
-    images_only = [file for file in files if file not in moving]
     needed = not moving and not done
-    read, refused = readable(images_only, opener.read, progress, needed)
-    doubts = {} if force else opener.unsuitable(read)
-    help = ""
+    read, refused = readable([file for file in files if file not in moving], opener.read, progress, needed)
+    doubts, help = {} if force else opener.unsuitable(read), ""
     if doubts:
         better = fitting_better(np.stack([read.pop(path)[0] for path in doubts]), TEMPLATES)
         help = f"{better}{better and '; '}--frame auto looks for another part, --force draws all"
+        if needed and not read:
+            path, doubt = next(iter(doubts.items()))
+            raise ValueError(f"{path}: {doubt}; {help}")
     refused |= doubts
-    if doubts and needed and not read:
-        path, doubt = next(iter(doubts.items()))
-        raise ValueError(f"{path}: {doubt}; {help}")
     with_row = [file for file in places if file in read or (file in done and not is_video(file))]
     shown = {file: kept / f"{places[file].name}.npz" for file in with_row}
     with_sheet = len(shown) > 1 if sheet is None else sheet
     with_sheet &= all(row.exists() for file, row in shown.items() if file in done)
     records: list[dict[str, Any]] = []
-    folders = [places[path] for path in read]
-    _require_free([*folders, *(places[path] for path in moving)], out, with_sheet, force or resume)
+    _require_free([places[path] for path in (*read, *moving)], out, with_sheet, force or resume)
     with _alone(out):
         images = opener.decomposed(read) if read else []
-        for image, folder in zip(images, folders, strict=True):
-            made = edit(opener.finer(image))
+        for image in images:
+            made, folder = edit(opener.finer(image)), places[image.path]
             if with_sheet:
                 cells = {name: np.asarray(enlarged(one, SHEET.cell)) for name, one in made.row.items()}
                 with atomic_file(shown[image.path]) as temporary, temporary.open("wb") as stream:
@@ -171,20 +165,20 @@ def write_images(
             with atomic_folder(folder) as temporary:
                 records.append(made.write(temporary, {"picture": str(image.path), "folder": str(folder)}))
             progress(len(records), len(images), description="drawing")
-        for path in moving:
+
+        def filmed(path: Path) -> dict[str, Any]:
             assert video is not None
-            try:
-                with atomic_folder(places[path]) as temporary:
-                    film = edit_video(
-                        path, temporary / FILM, opener.model, video, frame=opener.options.frame,
-                        fit_steps=opener.options.fit_steps, progress=progress,
-                    )  # fmt: skip
-                    record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
-                    (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
-            except (ValueError, OSError) as problem:
-                refused[path] = " ".join(str(problem).split())
-            else:
-                records.append(record)
+            with atomic_folder(places[path]) as temporary:
+                film = edit_video(
+                    path, temporary / FILM, opener.model, video, frame=how.frame, fit_steps=how.fit_steps,
+                    progress=progress,
+                )  # fmt: skip
+                record = {"picture": str(path), "folder": str(places[path]), **vars(film), "out": FILM}
+                (temporary / "moved.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+            return record
+
+        films, failed = readable(moving, filmed, needed=False)
+        records, refused = [*records, *films.values()], refused | failed
         if refused and not records and not done:
             raise ValueError(next(iter(refused.values())))
         rows = [(file.name, _row(row)) for file, row in shown.items()] if with_sheet else []

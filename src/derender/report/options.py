@@ -10,6 +10,17 @@ from typing import Any
 
 from derender.storage.places import require_known
 
+SIZE = (
+    "Side of the output: 384, of whole photographs and textures of meshes at most 1,024, of decompositions "
+    "the model's."
+)
+DETAIL = "photo: the image's own pixels. model: the model's albedo. Decompositions default to model."
+FIT = "Optimise each scene against its image in N steps; by default 10 for edits, else 0."
+FRAME = (
+    "face: the largest face. auto: the part that the model reconstructs best. none: the middle square. "
+    "By default face for models of faces, else none."
+)
+FILM = "Kinds of film: gif, mp4, both with a comma between, or none."
 CHOICES = {"detail": ("photo", "model"), "frame": ("face", "auto", "none")}
 OLD_TEXTURES = {"original": "photo", "model": "model"}
 OLD_CROPS = {"whole": "none", "auto": "auto"}
@@ -39,31 +50,11 @@ def option(default: Any, help: str | None, *names: str, **shown: Any) -> Any:
 class ImageOptions:
     """How an image is read and its scene drawn."""
 
-    size: int | None = option(
-        None,
-        "Side of the output: 384, of whole photographs and textures of meshes at most 1,024, of "
-        "decompositions the model's.",
-        min=8,
-        max=4096,
-    )
-    detail: str | None = option(
-        None,
-        "photo: the image's own pixels. model: the model's albedo. Decompositions default to model.",
-        metavar="photo|model",
-    )
+    size: int | None = option(None, SIZE, min=8, max=4096)
+    detail: str | None = option(None, DETAIL, metavar="photo|model")
     texture: str | None = option(None, "Old spelling of detail.", hidden=True)
-    fit_steps: int | None = option(
-        None,
-        "Optimise each scene against its image in N steps; by default 10 for edits, else 0.",
-        min=0,
-        max=10_000,
-    )
-    frame: str | None = option(
-        None,
-        "face: the largest face. auto: the part that the model reconstructs best. none: the middle square. "
-        "By default face for models of faces, else none.",
-        metavar="face|auto|none",
-    )
+    fit_steps: int | None = option(None, FIT, min=0, max=10_000)
+    frame: str | None = option(None, FRAME, metavar="face|auto|none")
     crop: str | None = option(None, "Old spelling of frame: whole or auto.", hidden=True)
     only_frame: bool = option(False, "Draw the frame only, not the whole photograph around it.")
     batch_size: int = option(64, "Images per batch; changes speed and memory only.", min=1, metavar="N")
@@ -84,9 +75,7 @@ class FilmOptions:
     """What a sweep is drawn as: a strip of stills and a film that goes there and back."""
 
     stills: int = option(7, "Number of images in the strip.", min=2, max=64, metavar="N")
-    film: str = option(
-        "gif,mp4", "Kinds of film: gif, mp4, both with a comma between, or none.", metavar="KINDS"
-    )
+    film: str = option("gif,mp4", FILM, metavar="KINDS")
     frames: int = option(48, "Number of frames of the film.", min=2, max=1000, metavar="N")
     hold: bool = option(False, "Hold a video's light or view at --reach, instead of going there and back.")
     seconds: float = option(4.0, "Length of the film in seconds.", min=0.1, max=60)

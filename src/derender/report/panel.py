@@ -29,8 +29,7 @@ class GridLayout:
     title: int = 24
 
 
-SHEET = GridLayout(cell=128)
-"""Of sheets with a row for each image."""
+SHEET = GridLayout(cell=128)  # of sheets with a row for each image
 
 
 def labelled_grid(
