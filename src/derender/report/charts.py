@@ -19,7 +19,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 from PIL import Image
 
 from derender.evaluation.disentanglement.card import DisentanglementCard
@@ -28,8 +27,7 @@ from derender.storage.atomic import write_whole
 
 SERIES = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#64748b")
 CONTROL_COLOUR = "#94a3b8"
-INK = "#010203"
-"""Becomes currentColor when the SVG text is written: the colour of the page's text, light or dark."""
+INK = "#010203"  # becomes currentColor when the SVG text is written: that of the page's text, light or dark
 T = TypeVar("T")
 
 
@@ -43,9 +41,7 @@ def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_labe
         axes.set_ylabel(y_label)
         axes.grid(True)
         axes.margins(x=0.01)
-        axes.xaxis.set_major_formatter(
-            FuncFormatter(lambda value, _: f"{value:,.0f}" if float(value).is_integer() else f"{value:g}")
-        )
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}" if float(x).is_integer() else f"{x:g}")
 
     # a legend at the upper left is seen where charts scroll
     return side_by_side({"": None}, draw, x_label, (7.2, 2.9), 3, "outside upper left")[0]
@@ -141,18 +137,15 @@ def card_matrices(card: DisentanglementCard) -> list[Matrix]:
         ("similarity.cross_r2", "cross-prediction R2", f"row predicts column; {apart}", names),
     ]
     if first.swap is not None:
-        shown += [
-            ("swap.moved", "swap: features", identity, names),
-            ("swap.moved_parameters", "swap: decoded", identity, names),
-        ]
+        titles = {"moved": "features", "moved_parameters": "decoded"}
+        shown += [(f"swap.{path}", f"swap: {title}", identity, names) for path, title in titles.items()]
     if first.truth is not None:
         note = "held out; best: one dark cell a column, in the right row"
         shown.append(("truth.score", "true factors: R2, accuracy of classes", note, first.truth.factors))
     whole = "best: white outside the blocks"
-    results = [Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole)]
-    for path, title, note, columns in shown:
-        results.append(Matrix(title, card.mean(path), names, columns, note=note))
-    return results
+    every = Matrix("|Pearson| of all dimensions", card.correlations, names, names, card.dimensions, whole)
+    rest = (Matrix(title, card.mean(path), names, columns, note=note) for path, title, note, columns in shown)
+    return [every, *rest]
 
 
 def write_card(card: DisentanglementCard, title: str, file: Path) -> None:

@@ -32,8 +32,7 @@ from derender.scene import Scene
 from derender.scene.enlarge import at_size
 
 SMALLEST_CELL, LARGEST_CELL = 128, 512
-FILM_SIZE = 512
-"""Largest side of a film of a whole photograph, in pixels."""
+FILM_SIZE = 512  # largest side of a film of a whole photograph, in pixels
 
 
 @dataclass(frozen=True)
@@ -79,27 +78,19 @@ def relit(
     """The image under other lighting: from right to left, or from its own to that of another image.
 
     Args:
-        model: renders the scenes.
-        image: is relit.
         reach_deg, pitch_deg: how far to the sides, and how high, the light goes, in degrees.
         strength: of the light, in multiples of the image's own.
         like: an image whose lighting is approached instead.
-        film: stills and frames.
     """
-    film = film or FilmOptions()
-    angle = _angle_text(reach_deg, film.stills)
     parameter = "light" if like is None else next(iter(like.scene.lighting))
 
     def lights(t: Tensor) -> Tensor:
-        if like is not None:
-            own, other = (one.scene.lighting[parameter] for one in (image, like))
-            return torch.lerp(own, other, t.to(own)[:, None])
-        return _lights(image.scene, t, reach_deg, pitch_deg, strength)
+        if like is None:
+            return _lights(image.scene, t, reach_deg, pitch_deg, strength)
+        own, other = (one.scene.lighting[parameter] for one in (image, like))
+        return torch.lerp(own, other, t.to(own)[:, None])
 
-    def label(place: float, row: Tensor) -> str:
-        return f"light {angle(degrees(row[3]))}" if like is None else f"{place:.0%} of its light"
-
-    return _swept(model, image, like, parameter, lights, label, film)
+    return _swept(model, image, like, parameter, lights, reach_deg, film)
 
 
 def rotated(
@@ -110,8 +101,6 @@ def rotated(
 
     Drawn in its own pixels it keeps its place and roll in the image; the model's rendering has none.
     """
-    film = film or FilmOptions()
-    angle = _angle_text(reach_deg, film.stills)
 
     def cameras(t: Tensor) -> Tensor:
         rows = sweeps.cameras_around(t, reach_deg, pitch_deg)
@@ -119,10 +108,7 @@ def rotated(
             rows[:, 2:] = image.scene.camera[:, 2:].to(rows)
         return rows
 
-    def label(_: float, row: Tensor) -> str:
-        return f"yaw {angle(degrees(row[1]))}"
-
-    return _swept(model, image, None, "camera", cameras, label, film)
+    return _swept(model, image, None, "camera", cameras, reach_deg, film)
 
 
 def swapped_factors(
@@ -181,12 +167,23 @@ def swappable(model: Derenderer, factors: Sequence[str] = ()) -> dict[str, str]:
 
 def _swept(
     model: Derenderer, image: OpenedImage, other: OpenedImage | None, parameter: str,
-    values: Callable[[Tensor], Tensor], label: Callable[[float, Tensor], str], film: FilmOptions,
+    values: Callable[[Tensor], Tensor], reach_deg: float, film: FilmOptions | None,
 ) -> Edit:  # fmt: skip
     """Stills and film of one scene along a sweep of one parameter."""
+    if not reach_deg:
+        raise ValueError("reach must not be 0 degrees")
+    film = film or FilmOptions()
+    decimals = max(0, ceil(-log10(2 * abs(reach_deg) / (film.stills - 1))))  # which distinguish the stills
 
     def drawn(rows: Tensor, render: sweeps.Render) -> Images:
         return sweeps.drawn(sweeps.varied(image.scene, **{parameter: rows}), render)
+
+    def label(place: float, row: Tensor) -> str:
+        if other is not None:
+            return f"{place:.0%} of its light"
+        word, angle_rad = ("yaw", row[1]) if parameter == "camera" else ("light", row[3])
+        angle = f"{degrees(angle_rad):+.{decimals}f}°"
+        return f"{word} {re.sub(r'^[+-](?=[0.]*°)', '', angle)}"  # 0 has no sign
 
     places = torch.linspace(0, 1, film.stills)
     rows = values(places)
@@ -196,13 +193,9 @@ def _swept(
         smaller = render.at_most(FILM_SIZE) if isinstance(render, Photograph) else render
         there = drawn(values(way[: len(way) // 2 + 1]), smaller)  # the way back shows the same
         moving = [there[min(number, len(way) - number)] for number in range(len(way))]
-    return Edit(
-        _inputs(model, image, other),
-        dict(zip(labels, drawn(rows, image.render), strict=True)),
-        {text: {parameter: row} for text, row in zip(labels, rows.tolist(), strict=True)},
-        moving,
-        film,
-    )
+    stills = dict(zip(labels, drawn(rows, render), strict=True))
+    numbers = {text: {parameter: row} for text, row in zip(labels, rows.tolist(), strict=True)}
+    return Edit(_inputs(model, image, other), stills, numbers, moving, film)
 
 
 def _inputs(model: Derenderer, image: OpenedImage, other: OpenedImage | None) -> dict[str, Image.Image]:
@@ -211,11 +204,3 @@ def _inputs(model: Derenderer, image: OpenedImage, other: OpenedImage | None) ->
     scene = at_size(image.scene, side)
     shown = {"input": pictures(image.shown[None])[0], "reconstruction": sweeps.drawn(scene, model.render)[0]}
     return shown if other is None else {**shown, "the other": pictures(other.shown[None])[0]}
-
-
-def _angle_text(reach_deg: float, stills: int) -> Callable[[float], str]:
-    """How angles of a sweep are written: with as many decimals as distinguish its stills."""
-    if not reach_deg:
-        raise ValueError("reach must not be 0 degrees")
-    decimals = max(0, ceil(-log10(2 * abs(reach_deg) / (stills - 1))))
-    return lambda angle_deg: re.sub(r"^[+-](?=[0.]*°)", "", f"{angle_deg:+.{decimals}f}°")  # 0 has no sign

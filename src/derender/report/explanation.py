@@ -72,11 +72,7 @@ def saliency_sheet(
 
 
 def draw_maps(
-    explained: Explained,
-    *,
-    labels: int = 3,
-    rows: int = 6,
-    progress: Callable[[int, int], object] | None = None,
+    explained: Explained, labels: int, rows: int, progress: Callable[[int, int], object]
 ) -> tuple[dict[str, dict[str, Image.Image]], list[attribution.Similarity]]:
     """Sheets for so many labels with the highest AUC, and the sanity check of the maps on the first of them.
 
@@ -102,13 +98,11 @@ def draw_maps(
             checks = attribution.sanity_check(model, probe, shares.shuffled, batch, asked, seeds=seeds)
             fresh, title = untrained_twin(model, 0), f"{name}: grad-cam with fresh weights"
             made["fresh weights"] = saliency_sheet(fresh, probe, batch, target, "grad-cam", title)
-            columns = {"input": pictures(batch)}
-            for factor in shares.factors:
-                seen = attribution.saliency("grad-cam", model, batch, factor)  # without a question
-                columns[factor] = overlays(batch, seen)
+            unasked = {one: attribution.saliency("grad-cam", model, batch, one) for one in shares.factors}
+            columns = {one: overlays(batch, seen) for one, seen in unasked.items()}
+            columns = {"input": pictures(batch), **columns}
             made["feature"] = labelled_grid(columns, title="the feature itself", layout=LAYOUT)
-        if progress is not None:
-            progress(place + 1, len(best))
+        progress(place + 1, len(best))
     return sheets, checks
 
 
@@ -122,12 +116,7 @@ NAMED, LONGEST_NAME = 6, 24
 
 
 def write_explanation(
-    explained: Explained,
-    out: str | Path,
-    *,
-    sheets: int = 3,
-    rows: int = 6,
-    progress: Callable[[int, int], object] | None = None,
+    explained: Explained, out: Path, *, sheets: int, rows: int, progress: Callable[[int, int], object]
 ) -> Explained:
     """Write the folder of an explanation, whole or not at all: page, chart, sheets of maps, and probe.
 
@@ -135,11 +124,11 @@ def write_explanation(
     called with (labels done, labels in all). Returns the explanation with ``checks``: how the maps answer to
     fresh weights. A FileExistsError: the folder holds other files.
     """
-    require_replaceable(Path(out), True, "explain.html")
-    drawn, checks = draw_maps(explained, labels=sheets, rows=rows, progress=progress)
+    require_replaceable(out, True, "explain.html")
+    drawn, checks = draw_maps(explained, sheets, rows, progress)
     explained = replace(explained, checks=checks)
     svg, png = share_chart(explained.shares)
-    with atomic_folder(Path(out)) as folder:
+    with atomic_folder(out) as folder:
         (folder / "shares.svg").write_text(svg, encoding="utf-8")
         (folder / "shares.png").write_bytes(png)
         for place, (name, made) in enumerate(drawn.items(), 1):
@@ -159,11 +148,9 @@ def explanation_page(
     asked = ", ".join(shares.names[:NAMED]) + (f" and {count - NAMED} more" if count > NAMED else "")
     if shares.kind == "labels" and count > 1:
         asked = f"{count} yes/no labels"
-    pair, faces = explained.pair, []
-    if pair is not None:
-        rows = [images.files.index(name) for name in pair[0]]
-        shown = zip(pictures(images.images[rows]), pair[0], strict=True)
-        faces = [(face, f"the image {name}", name) for face, name in shown]
+    names = () if (pair := explained.pair) is None else pair[0]
+    shown = zip(pictures(images.images[[images.files.index(name) for name in names]]), names, strict=True)
+    faces = [(face, f"the image {name}", name) for face, name in shown]
     values = {
         "shares": share_values(shares, chart), "sheets": sheets, "unchanged": attribution.UNCHANGED,
         "tables": tables, "checks": checks, "clusters": explained.clusters, "pair": pair, "faces": faces,

@@ -35,8 +35,8 @@ def comparison_page(
     title: str,
     tables: Sequence[ScoreTable],
     *,
-    lead: str = "",
-    facts: Mapping[str, object] | None = None,
+    lead: str,
+    facts: Mapping[str, object],
     failed: Sequence[str] = (),
 ) -> Page:
     """A self-contained page with the tables in reading order, one or two sentences (``lead``) over them.
@@ -44,7 +44,7 @@ def comparison_page(
     ``facts`` are models, data, seeds, settings; ``failed`` has a sentence for whatever is missing, with the
     reason.
     """
-    settings = {**(facts or {}), "derender": __version__}
+    settings = {**facts, "derender": __version__}
     shown = [(table, chart_of(table)) for table in tables]
     return Page("comparison.html", title, lead, {"tables": shown, "failed": failed, "settings": settings})
 
@@ -163,16 +163,11 @@ CELL = 192
 
 
 def search_sheet(
-    result: Found,
-    out: Path,
-    images: str | None = None,
-    *,
-    dataset: str = "auto",
-    progress: Progress | None = None,
+    result: Found, out: Path, images: str | None, *, dataset: str, progress: Progress
 ) -> list[str]:
     """Write the query and the nearest images as a contact sheet; gives the names of those it cannot read.
 
-    ``images`` is the address of the table's images, by default the one that the table records. ``dataset`` is
+    ``images`` is the address of the table's images; None is the one that the table records. ``dataset`` is
     their layout, or "auto". ``progress`` is called with (images read, all).
 
     Raises:
@@ -191,8 +186,7 @@ def search_sheet(
                 missing.remove(sample.file)
                 with suppress(Unreadable, ValueError, OSError):
                     read[sample.file] = decode(sample.read(), CELL, sample.fit, sample.box)
-                if progress is not None:
-                    progress(len(read), len(captions))
+                progress(len(read), len(captions))
             if not missing:
                 break
     if not read:
