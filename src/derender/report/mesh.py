@@ -15,7 +15,7 @@ import re
 from dataclasses import dataclass, replace
 from math import ceil, cos, radians
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -48,11 +48,7 @@ class Mesh:
     texture: Image.Image  # albedo, first row at the top
     trimmed: float  # share of the grid's cells that were left out, 0..1
     form: str = "glb"  # of the files that `write` makes, one of ``MESH_FORMATS``
-
-    @property
-    def row(self) -> dict[str, Image.Image]:
-        """Empty: meshes have no sheet."""
-        return {}
+    row: ClassVar[dict[str, Image.Image]] = {}  # of a sheet: meshes have none
 
     def write(self, folder: Path, record: dict[str, Any]) -> dict[str, Any]:
         """Write the files; returns their names and the mesh's size."""
@@ -60,13 +56,8 @@ class Mesh:
         files = self.files(home.name, self.form)
         for name, content in files.items():
             (folder / name).write_bytes(content)
-        return {
-            **record,
-            "files": [home / name for name in files],
-            "vertices": len(self.vertices),
-            "faces": len(self.faces),
-            "trimmed": self.trimmed,
-        }
+        size = {"vertices": len(self.vertices), "faces": len(self.faces), "trimmed": self.trimmed}
+        return {**record, "files": [home / name for name in files], **size}
 
     def files(self, name: str, form: str = "glb") -> dict[str, bytes]:
         """File name to content: ``NAME.glb``, or ``NAME.obj``, ``NAME.mtl`` and ``NAME.png``.
@@ -79,26 +70,24 @@ class Mesh:
         from trimesh.visual import TextureVisuals
         from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-        def shape(material: Any) -> Any:
-            visual = TextureVisuals(uv=self.uv, material=material)
-            return trimesh.Trimesh(
-                self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False
-            )
-
         how: dict[str, Any] = {"include_normals": True}
         if form == "glb":
             material = PBRMaterial(
                 name="albedo", baseColorTexture=self.texture, metallicFactor=0.0, roughnessFactor=1.0,
                 doubleSided=True,
             )  # fmt: skip
-            return {f"{name}.glb": shape(material).export(file_type="glb", **how)}
-        name = re.sub(r"[^\w.-]", "_", name)
-        matt = SimpleMaterial(image=self.texture, diffuse=[255] * 4, ambient=[0] * 4, specular=[0] * 4)
-        matt.name = name
-        how |= {"return_texture": True, "mtl_name": f"{name}.mtl"}
-        text, beside = shape(matt).export(file_type="obj", **how)
-        more = {file: beside[file] for file in (f"{name}.mtl", f"{name}.png")}
-        return {f"{name}.obj": text.encode(), **more}
+        else:
+            black = [0] * 4
+            material = SimpleMaterial(image=self.texture, diffuse=[255] * 4, ambient=black, specular=black)
+            material.name = name = re.sub(r"[^\w.-]", "_", name)
+            how |= {"return_texture": True, "mtl_name": f"{name}.mtl"}
+        visual = TextureVisuals(uv=self.uv, material=material)
+        shape: dict[str, Any] = {"vertex_normals": self.normals, "visual": visual, "process": False}
+        content: Any = trimesh.Trimesh(self.vertices, self.faces, **shape).export(file_type=form, **how)
+        if form == "glb":
+            return {f"{name}.glb": content}
+        text, beside = content
+        return {f"{name}.obj": text.encode()} | {one: beside[one] for one in (f"{name}.mtl", f"{name}.png")}
 
 
 def model_mesh(
@@ -137,7 +126,6 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
     """The mesh of one scene in its canonical view.
 
     Args:
-        scene: one scene.
         fov_deg: horizontal field of view.
         border_columns: pixel columns at each side that the model holds at one depth; they are left out.
         grazing_deg: cells whose surface is turned further from the viewer are left out, except those that the
