@@ -32,7 +32,6 @@ from derender.training.run_folder import read_metrics
 
 CLUSTERS_SHOWN, MEMBERS_SHOWN, INPUTS_SHOWN, BUNDLED_SHOWN = 5, 12, 10, 4
 COLUMNS_BESIDE = ("reconstruction", "normals", "albedo", "another view")
-Pixels = UInt8[np.ndarray, "n 3 h w"]
 
 
 def demo_page(result: DemoResult) -> Page:
@@ -88,11 +87,11 @@ def score_tables(result: DemoResult) -> dict[str, ScoreTable]:
     """Every table of the page by name."""
     own, steps = result.geometry.table(), result.settings.fit_steps
     notes = {BUNDLED: "bundled with derender; trained on 12,000 other faces of this family"}
-    models = [replace(own.rows[0], name=f"this run, {steps} steps per image" if steps else "this run")]
-    for name, other in result.geometry_beside.items():
-        models.append(replace(other.table().rows[0], name=name, note=notes.get(name, "")))
+    first = replace(own.rows[0], name=f"this run, {steps} steps per image" if steps else "this run")
+    others = {name: one.table().rows[0] for name, one in result.geometry_beside.items()}
+    beside = [replace(row, name=name, note=notes.get(name, "")) for name, row in others.items()]
     return {
-        "geometry": replace(own, rows=[*models, *own.rows[1:]]),
+        "geometry": replace(own, rows=[first, *beside, *own.rows[1:]]),
         "factors": result.factors.table(),
         "reconstruction": result.reconstruction.table(),
         "clustering": result.clustering,
@@ -107,7 +106,9 @@ def _tile(table: ScoreTable, column: int, *controls: str) -> tuple[str, str]:
     return cells[table.rows[0].name], f"{beside}; {DIRECTIONS[head.best]}"
 
 
-def _beside(models: Mapping[str, Derenderer], images: Pixels) -> dict[str, colours.Images]:
+def _beside(
+    models: Mapping[str, Derenderer], images: UInt8[np.ndarray, "n 3 h w"]
+) -> dict[str, colours.Images]:
     """Inputs, then what each model makes of them."""
     columns = {"input": colours.pictures(images)}
     for name, model in models.items():
@@ -118,26 +119,24 @@ def _beside(models: Mapping[str, Derenderer], images: Pixels) -> dict[str, colou
 
 def _beside_truth(result: DemoResult, rows: np.ndarray) -> dict[str, colours.Images]:
     truth, model = result.truth, optimised(result.model, result.settings.fit_steps)
+    assert truth.normal is not None and truth.albedo is not None  # as of every generated face
     images, mask = truth.images[rows], truth.mask[rows]
     depth, covered = predicted_depth(model, images)
     both = (covered & torch.as_tensor(mask)).float()
-    filled = torch.where(covered, depth, torch.ones_like(depth))
-    columns = {
-        "input": colours.pictures(images),
-        "predicted depth": colours.depth_maps(depth, both),
-        "true depth": colours.depth_maps(truth.depth[rows], mask),
-        "predicted normals": colours.normal_maps(normals_from_depth(filled, model.fov_deg), both),
-    }
-    if truth.normal is not None:
-        columns["true normals"] = colours.normal_maps(truth.normal[rows], mask)
+    normals = normals_from_depth(torch.where(covered, depth, 1.0), model.fov_deg)
     with torch.no_grad():
         scene = model.decompose(as_float(images))
         ambient = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand_as(scene.light)
         flat = model.render(scene.with_parameters(light=ambient))
-    columns["predicted albedo"] = colours.pictures(flat.image, both)
-    if truth.albedo is not None:
-        columns["true albedo"] = colours.pictures(truth.albedo[rows], mask)
-    return columns
+    return {
+        "input": colours.pictures(images),
+        "predicted depth": colours.depth_maps(depth, both),
+        "true depth": colours.depth_maps(truth.depth[rows], mask),
+        "predicted normals": colours.normal_maps(normals, both),
+        "true normals": colours.normal_maps(truth.normal[rows], mask),
+        "predicted albedo": colours.pictures(flat.image, both),
+        "true albedo": colours.pictures(truth.albedo[rows], mask),
+    }
 
 
 def _clusters(result: DemoResult) -> list[tuple[list[Any], str]]:
@@ -149,10 +148,9 @@ def _clusters(result: DemoResult) -> list[tuple[list[Any], str]]:
         groups.append((counts.max() / len(members), members))
     groups.sort(key=lambda group: (-group[0], -len(group[1])))
     shown = []
-    for pick in evenly_spaced(len(groups), CLUSTERS_SHOWN):
-        purity, members = groups[pick]
-        faces = colours.pictures(result.truth.images[members[:MEMBERS_SHOWN]])
-        names = result.identities[members[:MEMBERS_SHOWN]]
-        row = [(face, f"a face of {name}", name) for face, name in zip(faces, names, strict=True)]
+    for purity, members in (groups[pick] for pick in evenly_spaced(len(groups), CLUSTERS_SHOWN)):
+        some = members[:MEMBERS_SHOWN]
+        faces = zip(colours.pictures(result.truth.images[some]), result.identities[some], strict=True)
+        row = [(face, f"a face of {name}", name) for face, name in faces]
         shown.append((row, f"{len(members)} images, {100 * purity:.0f} % of one person"))
     return shown

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -36,23 +37,11 @@ from derender.settings import Settings
 from derender.training.config import TrainConfig, resolve
 from derender.training.task import Progress, TrainResult
 
-EDITOR = "faces-64"
-"""The bundled model that knows photographs."""
+EDITOR = "faces-64"  # the bundled model that knows photographs
 SHOWN, EXAMINED, REFRESH_S, SEED = 4, 12, 10, 7
-Photo = UInt8[np.ndarray, "h w 3"]
 
 
-@dataclass(frozen=True)
-class Opening:
-    """Edited photographs: column name to JPEG files, one for each photograph, and where these come from."""
-
-    columns: dict[str, list[bytes]]
-    names: list[str]
-    source: str
-
-
-Report = Callable[[str, int, int, str], None]
-"""Called with (stage, done, total, note)."""
+Report = Callable[[str, int, int, str], None]  # called with (stage, done, total, note)
 
 STAGES = ("generating faces", "learning perceptual features", "training", "estimating features", "scoring")
 
@@ -76,8 +65,7 @@ class LivePage:
         sample = samples[-1].read_bytes() if samples else None
         values = {"opening": self.opening, "status": status, "sample": sample}
         lead = "Depth, lighting and viewpoint are predicted from one image each, without labels."
-        page = Page("demo_opening.html", "Images decomposed", lead, values, refresh_s=REFRESH_S)
-        page.write(self.file)
+        Page("demo_opening.html", "Images decomposed", lead, values, refresh_s=REFRESH_S).write(self.file)
         self.updated = time.monotonic()
 
     def follow(self, progress: Progress, report: Report) -> None:
@@ -90,8 +78,8 @@ class LivePage:
         report(stage, progress.done, progress.total, note)
 
 
-def opening(address: str | Path | None = None, side: int = 512) -> Opening:
-    """Photographs relit, rotated, in the light of another; generated ones if no face is found."""
+def opening(address: str | Path | None = None, side: int = 512) -> dict[str, Any]:
+    """Photographs relit, rotated, in the light of another, for a page; generated ones if no face is found."""
     shown, source = [], "your photographs"
     if address is not None:
         read = read_images(address, side, limit=EXAMINED).images.transpose(0, 2, 3, 1)
@@ -100,39 +88,34 @@ def opening(address: str | Path | None = None, side: int = 512) -> Opening:
         shown, source = portraits(side), "generated portraits, which show no real person"
     model = load(EDITOR)
     photos = [open_photograph(photo, model) for photo in shown]
-    donors = [*photos[1:], photos[0]]
+    pairs = zip(photos, [*photos[1:], photos[0]], strict=True)
     columns = {
         "input": shown,
         "lit from the left, 60°": [photo.relit(60) for photo in photos],
         "lit from the right, 60°": [photo.relit(-60) for photo in photos],
         "rotated by 15°": [photo.rotated(15) for photo in photos],
-        "in the light of the next": [
-            photo.edited(light=donor.scene.light) for photo, donor in zip(photos, donors, strict=True)
-        ],
+        "in the light of the next": [photo.edited(light=donor.scene.light) for photo, donor in pairs],
     }
-    shown_as = {
-        name: [image_bytes(Image.fromarray(np.ascontiguousarray(one)), "JPEG", quality=88) for one in edited]
-        for name, edited in columns.items()
-    }
-    return Opening(shown_as, [f"photograph {row + 1}" for row in range(len(shown))], source)
+
+    def jpeg(photo: UInt8[np.ndarray, "h w 3"]) -> bytes:
+        return image_bytes(Image.fromarray(np.ascontiguousarray(photo)), "JPEG", quality=88)
+
+    files = {name: [jpeg(one) for one in edited] for name, edited in columns.items()}
+    names = [f"photograph {row + 1}" for row in range(len(shown))]
+    return {"columns": files, "names": names, "source": source}
 
 
-def portraits(side: int) -> list[Photo]:
+def portraits(side: int) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Generated heads of different people, lit from the front and, the last, from the side."""
     aside = LightSettings(yaw_deg=(32, 32), pitch_deg=(20, 20), ambient=(0.3, 0.3), diffuse=(0.55, 0.55))
     lights = [LIGHTS["frontal"]] * (SHOWN - 1) + [aside]
-    made = []
-    for row, light in enumerate(lights):
-        settings = FaceSettings(
-            light=light, view=VIEWS["frontal"], pictures_per_identity=1, expressions={"neutral": 1.0},
-            backgrounds=("plain",),
-        )  # fmt: skip
-        made.append(faces.generate(1, side, SEED + row, settings=settings).images[0].transpose(1, 2, 0))
-    return made
+    how = {"pictures_per_identity": 1, "expressions": {"neutral": 1.0}, "backgrounds": ("plain",)}
+    settings = [FaceSettings(light=light, view=VIEWS["frontal"], **how) for light in lights]
+    made = [faces.generate(1, side, SEED + row, settings=one) for row, one in enumerate(settings)]
+    return [one.images[0].transpose(1, 2, 0) for one in made]
 
 
-BUNDLED = "rendered-faces-64"
-"""The bundled model that has seen rendered faces only, as this demo's has."""
+BUNDLED = "rendered-faces-64"  # the bundled model that has seen rendered faces only, as this demo's has
 
 
 class DemoSettings(Settings):
@@ -185,7 +168,7 @@ class DemoResult:
     trained: TrainResult
     model: Derenderer
     bundled: Derenderer
-    opening: Opening  # photographs edited by a bundled model
+    opening: dict[str, Any]  # photographs edited by a bundled model
     seen: ImageSet  # images of the training
     truth: GroundTruth  # the unseen images with everything that made them
     # of scenes optimised for ``settings.fit_steps``; ``geometry_beside`` without steps, and by the bundled
@@ -220,8 +203,8 @@ def run_demo(
         FileExistsError: ``out`` is not empty.
         ValueError: training collapsed before it saved a model.
     """
-    out = Path(out)
-    live = LivePage(out, None, settings.portrait_px, report)
+    run = Path(out) / "run"
+    live = LivePage(Path(out), None, settings.portrait_px, report)
     opened(live.file)
     seconds: dict[str, float] = {}
     began, now = time.perf_counter(), STAGES[0]
@@ -239,12 +222,11 @@ def run_demo(
     count = settings.train_pictures
     seen, _ = _generated(count, size, train_seed, lambda done, _: at(STAGES[0], done, count))
     unseen, truth = _generated(settings.test_pictures, size, test_seed)
-    follow = partial(live.follow, report=at)
-    trained = train(seen, out=out / "run", config=config, page=False, progress=follow)
-    if not (out / "run" / "model").exists():
+    trained = train(seen, out=run, config=config, page=False, progress=partial(live.follow, report=at))
+    if not (run / "model").exists():
         reason = "; ".join(finding.text for finding in trained.findings) or trained.stopped
         raise ValueError(f"training collapsed before a model was saved ({reason}): try another --seed")
-    model, bundled = load(out / "run", device="cpu"), load(BUNDLED, device="cpu")
+    model, bundled = load(run, device="cpu"), load(BUNDLED, device="cpu")
     at(STAGES[4], 0, 4, "geometry")
     fitted = optimised(model, settings.fit_steps)
     geometry = evaluate_geometry(fitted, truth, untrained=untrained_twin(model, seed))
@@ -292,9 +274,8 @@ def run_own_demo(
     report(STAGES[4], 0, 1, "")
     page = run_page(run, run_evidence(run, images))
     values = {**page.values, "opening": live.opening}
-    return replace(page, template="demo_own.html", title="Your images decomposed", values=values).write(
-        live.file
-    )
+    page = replace(page, template="demo_own.html", title="Your images decomposed", values=values)
+    return page.write(live.file)
 
 
 def _generated(
@@ -305,9 +286,7 @@ def _generated(
     files = tuple(f"face-{row:05d}" for row in range(count))
     people = np.array([f"id{number:04d}" for number in made.identity])
     labels = {"identity": people, "expression": np.asarray(made.expression)}
-    truth = GroundTruth(
-        images=made.images, depth=made.depth, normal=made.normal,
-        albedo=made.albedo.astype(np.float32) / 255, mask=made.mask, light=made.light,
-        camera=made.camera, files=files, labels=labels,
-    )  # fmt: skip
+    same = ("images", "depth", "normal", "mask", "light", "camera")
+    known = {name: getattr(made, name) for name in same}
+    truth = GroundTruth(**known, albedo=made.albedo.astype(np.float32) / 255, files=files, labels=labels)
     return ImageSet(made.images, files, labels, layout="generated", source="generated faces"), truth
