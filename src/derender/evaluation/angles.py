@@ -60,9 +60,10 @@ def agreement_table(
     answers = {**predicted, "constant answer": np.full(len(true), true.mean())}
     scores = {name: agreement(np.asarray(own, np.float64), true, weights) for name, own in answers.items()}
     rows = [ScoredRow(name, at > 0, 1, own) for at, (name, own) in enumerate(scores.items())]
-    shown = ("r", "slope", "error")
     columns = {name: replace(one, digits=digits if one.digits == 2 else 3) for name, one in AGREEMENT.items()}
-    table = scored_table(caption, "prediction", rows, columns, intervals=shown, deviations=())
+    table = scored_table(
+        caption, "prediction", rows, columns, intervals=("r", "slope", "error"), deviations=()
+    )
     return table, numbers_of(rows)
 
 
@@ -127,8 +128,7 @@ def _angles(
     for name, net in nets.items():
         parts = map_batches(partial(see, net), net, read.images, batch_size=64, progress=how.stage(name))
         results[name] = np.concatenate(parts)
-    people = read.labels.get("identity", np.array(read.files)).astype(str)
-    weights = how.drawn(people)
+    weights = how.drawn(read.labels.get("identity", np.array(read.files)).astype(str))
     tables: list[ScoreTable] = []
     values: dict[str, Any] = {"pictures": len(read)}
     for column, name in enumerate(labels):
@@ -169,13 +169,11 @@ def known_angles(
             torch.from_numpy(np.stack([images.labels[name] for name in names], axis=1).astype(np.float32))
             for names in (rendered.LIGHT, rendered.CAMERA[:3])
         )
-        camera = torch.cat((turned, torch.zeros_like(turned)), dim=1)
-        true = _spherical(light_in_camera(given, camera)).numpy()
+        true = _spherical(light_in_camera(given, torch.nn.functional.pad(turned, (0, 3)))).numpy()
     else:
-        have = ", ".join(images.labels) or "none"
         raise ValueError(
-            f"{images.source} has no labels {', '.join(labels.values())} (it has {have}): give a table with "
-            f"name, {', '.join(labels)}"
+            f"{images.source} has no labels {', '.join(labels.values())} (it has "
+            f"{', '.join(images.labels) or 'none'}): give a table with name, {', '.join(labels)}"
         )
     known = np.flatnonzero(np.isfinite(true).all(axis=1))
     if len(known) < 2:

@@ -68,8 +68,7 @@ def numbers_of(rows: Iterable[ScoredRow]) -> dict[str, dict[str, Any]]:
             name: {"value": one.value, "low": one.low, "high": one.high, "spread": one.deviation}
             for name, one in row.scores.items()
         }
-        own = {"control": row.control, "runs": row.runs, "scores": scores, "versus": dict(row.versus)}
-        result[row.name] = own
+        result[row.name] = {"control": row.control, "runs": row.runs, "scores": scores, "versus": row.versus}
     return result
 
 

@@ -1,11 +1,10 @@
 """Clustering protocol: do features group images by a label that training never saw?
 
 Source: Klinghoffer et al., ECCV 2022, Sec. 4: Ward's hierarchical clustering with as many clusters as
-    classes; accuracy is weighted purity. The paper's CelebA figure is the mean over 40 attributes, each
-    with two clusters: one cut of one tree. A row that lacks one of several labels is clustered and does not
-    count for that label; a row without any is left out before.
-    ``majority`` is the score of one single cluster, ``chance`` that of the first features' clusters with rows
-    dealt at random.
+classes; accuracy is weighted purity. The paper's CelebA figure is the mean over 40 attributes, each with two
+clusters: one cut of one tree. A row that lacks one of several labels is clustered and does not count for that
+label; a row without any is left out before. ``majority`` is the score of one single cluster, ``chance`` that
+of the first features' clusters with rows dealt at random.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -14,7 +13,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from derender.evaluation import bootstrap, feature_rows
 from derender.evaluation import clustering_scores as measures
@@ -143,9 +142,9 @@ def compare_clusterings(
     rows, per_label = [], {}
     for name, parts in drawn.items():
         values = np.concatenate(parts, axis=1)  # (runs, 1 + resamples, labels, scores)
-        quiet = {*controls, "majority"}
+        quiet = name in {*controls, "majority"}
         mean = values.mean(axis=2)
-        rows.append(bootstrap.scored_row(name, name in quiet, measures.METRICS, mean, centred=True, most=1.0))
+        rows.append(bootstrap.scored_row(name, quiet, measures.METRICS, mean, centred=True, most=1.0))
         first_run = zip(labels, values[0, 0].tolist(), strict=True)
         per_label[name] = {label: dict(zip(measures.METRICS, own, strict=True)) for label, own in first_run}
     orders = [np.random.default_rng(one).permutation(n_rows) for one in measures.SEEDS]
@@ -183,21 +182,19 @@ def _scorer(
 
     The tables of counts of all labels are one product with one sparse matrix.
     """
-    shapes, rows, cells, start = [], [], [], 0
+    shapes, parts = [], []
     for name, classes in numbers.items():
         shapes.append((int(classes.max()) + 1, int(assignment[name].max()) + 1))
-        rows.append(np.flatnonzero(classes >= 0))
-        cells.append(start + (classes * shapes[-1][1] + assignment[name])[rows[-1]])
-        start += shapes[-1][0] * shapes[-1][1]
-    at = np.concatenate(cells), np.concatenate(rows)
-    shape = start, len(next(iter(numbers.values())))
-    matrix = csr_array((np.ones(len(at[0]), np.float32), at), shape=shape)
-    ends = np.cumsum([classes * clusters for classes, clusters in shapes])[:-1]
+        rows = np.flatnonzero(classes >= 0)
+        at = (classes * shapes[-1][1] + assignment[name])[rows], rows
+        shape = shapes[-1][0] * shapes[-1][1], len(classes)
+        parts.append(csr_array((np.ones(len(rows), np.float32), at), shape=shape))
+    matrix, ends = vstack(parts, format="csr"), np.cumsum([part.shape[0] for part in parts])[:-1]
 
     def scores(weights: np.ndarray) -> np.ndarray:
-        parts = zip(np.split((matrix @ weights.T).T, ends, axis=1), shapes, strict=True)
-        counts = (part.reshape(-1, *shape) for part, shape in parts)
-        return np.stack([measures.scores_of_counts(one) for one in counts], axis=1)
+        counts = zip(np.split((matrix @ weights.T).T, ends, axis=1), shapes, strict=True)
+        each = [measures.scores_of_counts(part.reshape(-1, *shape)) for part, shape in counts]
+        return np.stack(each, axis=1)
 
     return scores
 
@@ -241,8 +238,7 @@ def finch_table(name: str, levels: Sequence[Level], classes: int) -> ScoreTable:
     columns = (
         Column("accuracy", None, note="weighted purity, 0 to 1; grows with the number of clusters"),
         Column("by chance", None, note="accuracy of the same cluster sizes, rows dealt at random"),
-        measures.CLUSTER_COLUMNS["nmi"],
-        measures.CLUSTER_COLUMNS["ari"],
+        *(measures.CLUSTER_COLUMNS[score] for score in ("nmi", "ari")),
     )
     rows = []
     for one in levels:

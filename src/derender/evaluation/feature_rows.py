@@ -326,9 +326,8 @@ def control_rows(
 def architecture(rows: Sequence[FeatureRow]) -> ModelSettings | None:
     """The model settings of the first row that a ``Derenderer`` made; None if there is none."""
     for row in rows:
-        origin = row.tables[0].origin
-        own = origin.get("model", Derenderer.__name__) == Derenderer.__name__
-        stored = origin.get("settings") if own else None
+        origin, ours = row.tables[0].origin, Derenderer.__name__
+        stored = origin.get("settings") if origin.get("model", ours) == ours else None
         if stored is not None and not row.control:
             try:
                 return ModelSettings.model_validate(stored)

@@ -10,7 +10,6 @@ its own for the head.
 
 import copy
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -32,10 +31,10 @@ from derender.evaluation.linear_task import Rows, Task, task_of
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Scores, scored_table, verdict
-from derender.features import map_batches, model_fingerprint, named
+from derender.features import chosen, map_batches, model_fingerprint
 from derender.inputs import Progress
 from derender.model import Derenderer, load
-from derender.storage.atomic import atomic_file, new_folder
+from derender.storage.atomic import new_folder, write_whole
 from derender.storage.bounded import read_json
 from derender.storage.tensors import read_tensors, write_tensors
 from derender.training.config import FinetuneConfig
@@ -138,8 +137,7 @@ def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
     """
     target = config.target
     if not target.labels:
-        known = ", ".join(images.labels) or "no labels"
-        raise ValueError(f"name a label to learn; the images have {known}")
+        raise ValueError(f"name a label to learn; the images have {', '.join(images.labels) or 'no labels'}")
     names = ", ".join(target.labels)
     asked = task_of({name: images.label(name) for name in target.labels})
     split = split_indices(images.files, config.split, seed=config.seed)
@@ -181,9 +179,7 @@ class FinetuneTask(TrainingTask):
                 "model.ranges"
             )
         model = copy.deepcopy(self.start) or Derenderer.seeded(config.model, config.seed)
-        known = {factor.name: factor for factor in model.factors}
-        for name in factors:
-            named(known, name, "factor")
+        chosen(factors, {factor.name: factor for factor in model.factors})
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             width = config.model.network.code_size * len(factors)
@@ -200,8 +196,7 @@ class FinetuneTask(TrainingTask):
             if config.start is not None and config.objective.perceptual == "self":
                 there = RunFolder(Path(config.start)).perceptual  # its sigmas belong to them
                 if there.is_file() and not run.perceptual.exists():
-                    with atomic_file(run.perceptual) as temporary:
-                        shutil.copyfile(there, temporary)
+                    write_whole(run.perceptual, there.read_bytes())
             rendering = DerenderTask(config).losses(model.model, run, images, progress)
         known = torch.from_numpy(self.target.visible).float().to(images.device)
 
@@ -294,8 +289,7 @@ def score_finetuned(
     )
     if unlabelled:
         caption += f"; {unlabelled:,} images without label never asked"
-    every: dict[str, Any] = {"intervals": BOTH, "deviations": ()}
-    table = scored_table(caption, "trained on labels", scored, LINEAR_COLUMNS, **every)
+    table = scored_table(caption, "trained on labels", scored, LINEAR_COLUMNS, intervals=BOTH, deviations=())
     values = {
         "rows": numbers_of(scored), "versus": {score: asdict(judged[0].versus[score]) for score in BOTH},
         "kind": asked.kind, "names": names, "n_train": count, "n_test": len(test), "n_unlabelled": unlabelled,

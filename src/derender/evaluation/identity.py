@@ -86,26 +86,24 @@ def identify(
         note = f"Ward clusters of {int(near.sum()):,} images up to {cluster_within:g} degrees, gallery too"
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
         columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
+    people = len(set(who[probe]))
     caption = (
-        f"Identification: {len(probe):,} probes of {len(set(who[probe]))} people, gallery of "
-        f"{int(shown.sum())}, nearest by cosine{' less the mean of the gallery' if centred else ''}"
+        f"Identification: {len(probe):,} probes of {people} people, gallery of {int(shown.sum())}, "
+        f"nearest by cosine{' less the mean of the gallery' if centred else ''}"
     )
     asked = "Above the strongest control? (people are resampled together)"
     tables = judged_tables(caption, "features", scored, columns, asked, deviations=())
-    values = {
-        "people": len(set(who[probe])), "gallery": [table.files[row] for row in np.flatnonzero(shown)],
-        "probes": probes, "centred": centred,
-        "rows": bootstrap.numbers_of(scored),
-    }  # fmt: skip
+    files, numbers = [table.files[row] for row in np.flatnonzero(shown)], bootstrap.numbers_of(scored)
+    values = {"people": people, "gallery": files, "probes": probes, "centred": centred, "rows": numbers}
     notes = [*how.notes, verdict(scored[0], "all", columns["all"]), how.memory.summary()]
     return Scores(tables, values, notes, scored)
 
 
 def _angles(table: FeatureTable, by: str | None) -> np.ndarray:
     """Sizes of a column of angles in degrees, (N,); NaN where no column was named and there is no light."""
-    if by is None and "light_deg" not in table.labels:
-        return np.full(len(table), np.nan)
     name = by or "light_deg"
+    if by is None and name not in table.labels:
+        return np.full(len(table), np.nan)
     values = table.label(name)
     if values.dtype.kind not in "fiu":
         raise ValueError(f"label {name!r} holds no numbers: name a column of angles in degrees")
@@ -198,8 +196,7 @@ def verify(
     Raises:
         ValueError: the pairs cannot be read, or name images that are not there.
     """
-    pairs = pairs if isinstance(pairs, Pairs) else read_pairs(pairs)
-    pairs = _in_half(pairs, half)
+    pairs = _in_half(pairs if isinstance(pairs, Pairs) else read_pairs(pairs), half)
     how = Options.of(options, keep_duplicates=True, descriptors=True)
     names = {*pairs.first, *pairs.second}
     if is_model(features):
@@ -235,9 +232,8 @@ def verify(
         scored.append(bootstrap.scored_row(row.name, row.control, columns, both))
         each = [right[:, pairs.fold == fold].mean() for fold in np.unique(pairs.fold)]
         errors[row.name] = float(np.std(each, ddof=1) / np.sqrt(len(each)))
-    half_right = bootstrap.constant(0.5, how.resamples)
-    scored.append(bootstrap.ScoredRow("chance", True, 1, {"accuracy": half_right, "auc": half_right}))
-    scored = bootstrap.with_verdicts(scored)
+    by_chance = dict.fromkeys(columns, bootstrap.constant(0.5, how.resamples))
+    scored = bootstrap.with_verdicts([*scored, bootstrap.ScoredRow("chance", True, 1, by_chance)])
     error = Column("± SE", None, note="standard error of accuracy over folds")
     n_folds, n_same = len(set(pairs.fold.tolist())), int(pairs.same.sum())
     caption = (
@@ -295,8 +291,7 @@ def _judged(run: np.ndarray, sides: np.ndarray, pairs: Pairs) -> tuple[np.ndarra
 def _best_threshold(cosine: np.ndarray, same: np.ndarray) -> float:
     """The threshold that judges most pairs right; half-way between the two cosines around it."""
     order = np.argsort(-cosine, kind="stable")
-    gained = np.cumsum(np.where(same[order], 1, -1))
-    last = int(gained.argmax())
+    last = int(np.cumsum(np.where(same[order], 1, -1)).argmax())
     following = cosine[order][min(last + 1, len(order) - 1)]
     return float(cosine[order][last] + following) / 2
 
@@ -309,8 +304,7 @@ def area_under_roc(score: np.ndarray, positive: np.ndarray, weights: np.ndarray 
     weights = np.ones((1, len(score))) if weights is None else weights.astype(np.float64)
     order = np.argsort(score, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(score[order]) > 0])
-    wins, losses = (
-        np.add.reduceat((weights * side)[:, order], starts, axis=1) for side in (positive, ~positive)
-    )
+    sides = ((weights * side)[:, order] for side in (positive, ~positive))
+    wins, losses = (np.add.reduceat(side, starts, axis=1) for side in sides)
     below = np.cumsum(losses, axis=1) - losses / 2
     return (wins * below).sum(axis=1) / (wins.sum(axis=1) * losses.sum(axis=1))

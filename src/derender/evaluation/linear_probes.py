@@ -23,6 +23,7 @@ import torch
 from pydantic import Field
 from scipy.special import expit, log_softmax, softmax
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from derender.evaluation.linear_task import Task
 from derender.evaluation.memory import Memory
@@ -159,12 +160,10 @@ def fitted_heads(
     x = torch.from_numpy(np.ascontiguousarray(features, np.float32))
     y = torch.from_numpy(np.asarray(targets, np.float32))
     streams, chosen = [torch.Generator().manual_seed(seed) for seed in seeds], torch.from_numpy(rows)
-    weight, bias = (  # uniform in +-1/sqrt(inputs), as torch's linear layer starts
-        torch.stack(
-            [(torch.rand(shape, generator=one) * 2 - 1) / x.shape[1] ** 0.5 for one in streams]
-        ).requires_grad_()
-        for shape in ((x.shape[1], y.shape[1]), (1, y.shape[1]))
-    )
+    shapes = (x.shape[1], y.shape[1]), (1, y.shape[1])
+    starts = (torch.stack([torch.rand(shape, generator=one) for one in streams]) for shape in shapes)
+    # uniform in +-1/sqrt(inputs), as torch's linear layer starts
+    weight, bias = (((start * 2 - 1) / x.shape[1] ** 0.5).requires_grad_() for start in starts)
     optimiser = torch.optim.Adam([weight, bias], lr=settings.learning_rate)
     means = x.new_zeros(len(rows), 1, x.shape[1])
     if centred:
@@ -184,14 +183,12 @@ def head_loss(logits: Tensor, targets: Tensor, kind: str) -> Tensor:
 
     ``targets`` are -1 (unknown), 0, 1; for classes one-hot, or all -1. 0 where none is known.
     """
+    known, truth = targets >= 0, targets.clamp(min=0)
     if kind == "classes":
-        each = -(torch.log_softmax(logits, dim=-1) * targets.clamp(min=0)).sum(dim=-1)
-        known = (targets >= 0).any(dim=-1)
+        each = -(torch.log_softmax(logits, dim=-1) * truth).sum(dim=-1)
+        known = known.any(dim=-1)
         return (each * known).sum(dim=1) / known.sum(dim=1).clamp(min=1)
-    known = (targets >= 0).float()
-    each = torch.nn.functional.binary_cross_entropy_with_logits(
-        logits, targets.clamp(min=0), weight=known, reduction="none"
-    )
+    each = binary_cross_entropy_with_logits(logits, truth, weight=known.float(), reduction="none")
     return each.sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)
 
 
@@ -248,8 +245,8 @@ def logistic_weights(
     chosen = np.asarray(penalties)[np.argmin(losses, axis=0)]
     whole = np.ones((len(rows), 1), bool)
     result = {c: solve_logistic(rows, labels, whole, c, kind)[:, 0] for c in set(chosen.tolist())}
-    own = chosen.tolist() if kind == "labels" else chosen.tolist() * labels.shape[1]
-    picked = np.stack([result[c][:, label] for label, c in enumerate(own)], axis=1)
+    own = np.broadcast_to(chosen, labels.shape[1])
+    picked = np.stack([result[c][:, label] for label, c in enumerate(own.tolist())], axis=1)
     return back @ picked[:-1], picked[-1] - mean @ (back @ picked[:-1]), chosen
 
 
@@ -268,8 +265,8 @@ def solve_logistic(
     counted = (learned[:, :, None] & (targets >= 0)[:, None]).astype(dtype)
     ridge = np.append(np.ones(rows.shape[1]), 0.0)[:, None, None].astype(dtype)
     curve = 0.25 if kind == "labels" else 0.5
-    bound = curve * (design.astype(np.float64) ** 2).sum(axis=0)[:, None, None] * c + ridge
-    bound, strength = bound.astype(dtype), dtype.type(c)
+    power = (design.astype(np.float64) ** 2).sum(axis=0)[:, None, None]
+    bound, strength = (curve * power * c + ridge).astype(dtype), dtype.type(c)
     weights = ahead = np.zeros((design.shape[1], learned.shape[1], targets.shape[1]), dtype)
     momentum, start = np.ones((1, learned.shape[1], 1), dtype), None
     for step in range(MOST_STEPS):

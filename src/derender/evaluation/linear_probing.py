@@ -230,12 +230,11 @@ def compare_linear(
         return replace(row, scores={**row.scores, "average_precision": precision})
 
     again: dict[str, Any] = {"settings": settings, "memory": memory}
+    tuned = finetuned or {}
     total, done, parts = len(heads) * len(rows.train) * len(features), 0, []
-    for head in (*heads, *([FINETUNED] if finetuned else [])):
+    for head in (*heads, *([FINETUNED] if tuned else [])):
         for count, own in rows.train.items():
-            answers = {}
-            if head == FINETUNED:
-                answers = {name: by_count[count] for name, by_count in (finetuned or {}).items()}
+            answers = {name: each[count] for name, each in tuned.items() if head == FINETUNED}
             for name, arrays in features.items() if head != FINETUNED else ():
                 answers[name] = probes.probe_runs(head, arrays, task, own, rows.test, seeds, **again)
                 done += 1

@@ -61,19 +61,17 @@ def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     points = unit_rows(points)
     nearest, distance = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
 
-    def look(rows: np.ndarray, others: np.ndarray | slice, own: np.ndarray) -> None:
-        """Find the nearest of some others, in which the rows themselves stand at ``own``."""
-        candidates = points[others]
-        at_once = max(1, NUMBERS_AT_ONCE // len(candidates))
-        for start in range(0, len(rows), at_once):
-            part = rows[start : start + at_once]
+    def look(rows: np.ndarray, others: np.ndarray) -> None:
+        """Find the nearest of some others, in ascending order, the rows themselves among them."""
+        candidates = points if len(others) == len(points) else points[others]
+        at_once = max(1, NUMBERS_AT_ONCE // len(others))
+        for part in np.split(rows, range(at_once, len(rows), at_once)):
             block = 1 - points[part] @ candidates.T
-            block[np.arange(len(part)), own[start : start + at_once]] = np.inf
-            nearest[part] = block.argmin(axis=1)
-            distance[part] = block[np.arange(len(part)), nearest[part]]
+            block[np.arange(len(part)), np.searchsorted(others, part)] = np.inf
+            distance[part], nearest[part] = block.min(axis=1), others[block.argmin(axis=1)]
 
     if len(points) <= EXACT_ROWS:
-        look(np.arange(len(points)), slice(None), np.arange(len(points)))
+        look(np.arange(len(points)), np.arange(len(points)))
         return nearest, distance
     points = points.astype(np.float32, copy=False)
     groups = cells(points, CELL_ROWS)
@@ -84,9 +82,7 @@ def nearest_rows(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     near = np.argsort(apart, axis=1, kind="stable")[:, : NEAR_CELLS + 1]
 
     def look_around(cell: int) -> None:
-        others = np.sort(np.concatenate([groups[one] for one in near[cell]]))
-        look(groups[cell], others, np.searchsorted(others, groups[cell]))
-        nearest[groups[cell]] = others[nearest[groups[cell]]]
+        look(groups[cell], np.sort(np.concatenate([groups[one] for one in near[cell]])))
 
     of_each(look_around, groups)
     return nearest, distance

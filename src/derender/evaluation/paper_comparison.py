@@ -73,8 +73,7 @@ def compare(
                 raise ValueError(f"two models have the name {name!r}: give each its own")
             result = segment(
                 model, images, masks=masks, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
-                settings=SegmentSettings(epochs=epochs), dataset=how.dataset, limit=how.limit, seed=how.seed,
-                device=how.device, resamples=how.resamples, cache=how.memory, progress=how.progress,
+                settings=SegmentSettings(epochs=epochs), **{**options, "cache": how.memory},
             )  # fmt: skip
             shown = (result.tables[-1], *result.tables[:-1])
             tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]

@@ -139,8 +139,8 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
         return (weights * values) @ member / np.maximum(weights @ member, 1e-9)
 
     def share(bright: np.ndarray) -> Estimate:
-        own, shown = (np.log(np.maximum(means(one), 1e-6)) for one in (bright, picture))
-        own, shown = (one - one.mean(axis=1, keepdims=True) for one in (own, shown))
+        both = (np.log(np.maximum(means(one), 1e-6)) for one in (bright, picture))
+        own, shown = (one - one.mean(axis=1, keepdims=True) for one in both)
         values = (own * shown).sum(axis=1) / (shown * shown).sum(axis=1)
         return estimate(values[:1], values[1:])
 
@@ -148,9 +148,9 @@ def _by_group(nets: Mapping[str, Any], images: ImageSet, by: str, how: Options) 
     shown = {"image": picture, "albedo": seen["model"]["albedo"] @ LUMA, "light": seen["model"]["light"]}
     result = {what: means(one) for what, one in shown.items()}
     groups = []
-    for at, (name, number) in enumerate(zip(names, member.sum(axis=0), strict=True)):
+    for at, name in enumerate(names):
         scores = {what: estimate(own[:1, at], own[1:, at]) for what, own in result.items()}
-        groups.append(ScoredRow(f"{name} ({int(number):,})", False, 1, scores))
+        groups.append(ScoredRow(f"{name} ({(group == name).sum():,})", False, 1, scores))
     columns = {what: Column(what, None, note="mean brightness, 0 to 1") for what in result}
     columns["light"] = Column("light", None, note="mean shading")
     answers = {name: one["albedo"] @ LUMA for name, one in seen.items()} | {"image as albedo": picture}
@@ -201,9 +201,8 @@ def relight(
     read = how.at(model.image_size)
     if lacking := [name for name in NEEDED if name not in read.labels]:
         raise ValueError(f"{read.source} has no label {lacking[0]!r}: give images of known light, as Yale B")
-    large = read if isinstance(images, ImageSet) else as_images(
-        images, size, dataset=how.dataset, limit=how.limit, keep_duplicates=True
-    )  # fmt: skip
+    same: dict[str, Any] = {"dataset": how.dataset, "limit": how.limit, "keep_duplicates": True}
+    large = read if isinstance(images, ImageSet) else as_images(images, size, **same)
     scenes_of = partial(editable_scenes, model, steps=fit_steps)
     batches = map_batches(scenes_of, model, read.images, batch_size=64, progress=how.stage("model"))
     scenes = Scene.joined(batches)
@@ -234,13 +233,9 @@ def relight(
             rendered = model.render(at_size(target, photos.shape[-1]))
             drawn = model.render(at_size(scenes[source], photos.shape[-1])).mask > 0.5
         mask = drawn.float().cpu() * photographed
-        answers = (
-            edited.image,
-            rendered.image,
-            photos[source].expand_as(ratio),
-            torch.stack([photos[near].mean(dim=0) for near in alike]),
-            photos[source] * ratio.clamp(0.05, 20),
-        )
+        mean = torch.stack([photos[near].mean(dim=0) for near in alike])
+        copied = photos[source].expand_as(ratio), mean, photos[source] * ratio.clamp(0.05, 20)
+        answers = (edited.image, rendered.image, *copied)
         for name, drawn in zip(("photograph relit", "model's rendering", *CONTROLS), answers, strict=True):
             shown, covered = drawn.float().cpu().clamp(0, 1), mask.expand(len(targets), -1, -1)
             scores = reconstruction_scores(shown, photos[targets], covered)

@@ -94,10 +94,6 @@ class ScoreTable:
             return None
         return max(numbers) if end == "high" else min(numbers)
 
-    def largest(self, column: int) -> float:
-        """The largest absolute number of a column, 0 without any."""
-        return max(map(abs, self.numbers(column)), default=0.0)
-
     def texts(self, row: Row) -> list[tuple[str, bool]]:
         """Each cell of a row as text, and whether it is the best of its column."""
         return [

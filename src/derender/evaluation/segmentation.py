@@ -99,18 +99,15 @@ class SegmentationComparison:
             f"{(share > 0).sum()} of {len(data.classes)} classes tested, {self.settings.epochs} epochs, "
             f"{counted(len(self.seeds), 'seeds')}"
         )
-        trainable = {row.scored.name: row.trainable for row in self.rows}
-        learn = Column("learn", note="number of trained weights")
-        more = {learn: lambda row: trainable[row.name] or None}
+        trainable = {row.scored.name: row.trainable or None for row in self.rows}
+        more = {Column("learn", note="number of trained weights"): lambda row: trainable[row.name]}
         tables = [scored_table(caption, "net", scored, COLUMNS, more=more)]
         if any(row.versus for row in scored):
             tables.append(verdict_table(scored, COLUMNS, "above the strongest control?"))
         learning = [row for row in self.rows if row.trainable]
         columns = [Column(row.scored.name, None, note="IoU, 0 to 1") for row in learning]
-        classes = [
-            Row(data.classes[at], (float(share[at]), *(float(row.class_iou[at]) for row in learning)))
-            for at in np.argsort(-share, kind="stable").tolist()
-        ]
+        cells = np.column_stack([share, *(row.class_iou for row in learning)]).tolist()
+        classes = [Row(data.classes[at], cells[at]) for at in np.argsort(-share, kind="stable").tolist()]
         heads = (Column("share", note="of the tested pixels"), *columns)
         tables.append(ScoreTable("intersection over union of every class", "class", heads, classes))
         plain: dict[str, Any] = {"intervals": (), "deviations": ()}
@@ -208,8 +205,7 @@ def segment(
     apart = Memory(how.memory.folder)  # controls are cached as well, but are no runs
     for title, control in segmenters.CONTROLS.items():
         made = partial(lambda control: counted(control(data)), control)
-        run = apart.recall("segment-control", {**same, "control": title}, made)
-        rows.append(row(title, True, [run], 0))
+        rows.append(row(title, True, [apart.recall("segment-control", {**same, "control": title}, made)], 0))
     judged = zip(rows, with_verdicts([row.scored for row in rows]), strict=True)
     compared = tuple(replace(row, scored=scored) for row, scored in judged)
     result = SegmentationComparison(compared, data, tuple(seeds), settings, shown)

@@ -99,9 +99,8 @@ def divide(
             f"the {len(train):,} masks to learn from in {images.source} show one class only "
             f"({classes[int(seen[0])]}): segmentation needs two or more"
         )
-    return SegmentationData(
-        images.images, masks, tuple(classes), train, test, rule, images.source, images.layout
-    )
+    about = (rule, images.source, images.layout)
+    return SegmentationData(images.images, masks, tuple(classes), train, test, *about)
 
 
 LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
@@ -199,12 +198,11 @@ class SegmentationNet(nn.Module):
             last = decoder.to_outputs
             self.decoder.to_outputs = nn.Conv2d(last.in_channels, outputs, 1, device=last.weight.device)
         self.frozen = frozen
-        self._fixed: list[nn.Module] = []  # parts whose BatchNorm keeps its statistics
+        # parts whose BatchNorm keeps its statistics
+        self._fixed: list[nn.Module] = [self.encoders] if frozen or kept_statistics else []
         if decoder is not None:
-            self._fixed = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
-            self._fixed.append(self.decoder.convolve[-LEVELS_KEPT:])
-        elif frozen or kept_statistics:
-            self._fixed = [self.encoders]
+            levels = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
+            self._fixed = [*levels, self.decoder.convolve[-LEVELS_KEPT:]]
 
     @property
     def device(self) -> torch.device:
@@ -232,10 +230,9 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
         torch.manual_seed(seed)
         encoders = [copy.deepcopy(model.nets[factor].encoder) for factor in variant.factors]
         decoder_seed = int(torch.randint(2**31, ()))
-        if not variant.pretrained:
-            for module in (module for encoder in encoders for module in encoder.modules()):
-                if isinstance(module, nn.Conv2d | nn.BatchNorm2d):
-                    module.reset_parameters()
+        for module in nn.ModuleList(encoders).modules() if not variant.pretrained else ():
+            if isinstance(module, nn.Conv2d | nn.BatchNorm2d):
+                module.reset_parameters()
         torch.manual_seed(decoder_seed)
         how = {"frozen": variant.frozen, "kept_statistics": variant.pretrained}
         decoder = model.unet_decoder if variant.decoder else None
@@ -262,8 +259,7 @@ def train_segmenter(
         for _ in range(settings.epochs):
             order = data.train[torch.randperm(len(data.train), generator=generator).numpy()]
             total = 0.0
-            for start in range(0, len(order), batch_size):
-                rows = order[start : start + batch_size]
+            for rows in np.split(order, range(batch_size, len(order), batch_size)):
                 truth = torch.from_numpy(data.masks[rows]).to(net.device).long()
                 loss = cross_entropy(net(as_batch(data.images[rows], net.device)), truth)
                 optimiser.zero_grad(set_to_none=True)

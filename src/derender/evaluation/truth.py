@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion, generate_binary_structure
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from derender.data import GroundTruth
 from derender.evaluation.image_scores import ImageResult, means_and_each
@@ -156,9 +157,7 @@ def evaluate_geometry(
     """
     check_size(model, truth.images, rendered=True)
     depth, mask = torch.as_tensor(truth.depth), torch.as_tensor(truth.mask) > 0
-    normal = None
-    if truth.normal is not None:
-        normal = torch.nn.functional.normalize(torch.as_tensor(truth.normal), dim=-1)
+    normal = None if truth.normal is None else normalize(torch.as_tensor(truth.normal), dim=-1)
 
     def score(predicted: Tensor, covered: Tensor) -> GeometryScores:
         return geometry_scores(predicted, covered, depth, mask, model.fov_deg, normal)

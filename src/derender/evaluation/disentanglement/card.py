@@ -25,9 +25,9 @@ from derender.evaluation.disentanglement.similarity import (
     pearson,
     similarity,
 )
-from derender.evaluation.disentanglement.swap import Encodings, SwapScores, swap_test, unexchanged
+from derender.evaluation.disentanglement.swap import SwapScores, swap_test, unexchanged
 from derender.evaluation.options import Options
-from derender.evaluation.score_table import Cell, Column, Interval, Row, Scores, ScoreTable, interval_column
+from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
 from derender.features.table import check_finite
 from derender.inputs import as_images, as_model
@@ -113,7 +113,7 @@ class DisentanglementCard:
             swap = {name: value for name, value in vars(scores.swap).items() if name != "resampled"}
             return {**vars(scores), "swap": swap | swap_intervals([scores.swap])}
 
-        return {name: [plain(scores) for scores in results] for name, results in self.rows.items()}
+        return {name: list(map(plain, results)) for name, results in self.rows.items()}
 
     def tables(self) -> list[ScoreTable]:
         """The summary, the swap test's matrices, and where true factors are known the scores against them."""
@@ -145,8 +145,7 @@ class DisentanglementCard:
         rows = []
         for name, results in self.rows.items():
             ends = swap_intervals([one.swap for one in results if one.swap is not None])
-            means: list[Cell] = []
-            deviations: list[Cell] = []
+            means, deviations = [], []
             for path in columns:
                 values = [] if path in ENDS else [v for one in results if (v := one.get(path)) is not None]
                 means.append(ends.get(path, float(np.mean(values)) if values else None))
@@ -232,11 +231,8 @@ def disentangle(
     def swapped(seed: int) -> np.ndarray:
         return np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
 
-    @cache
-    def encoded() -> tuple[np.ndarray, tuple[Encodings, Encodings]]:
-        """The images of all seeds' swap tests, and the model's encodings that these share."""
-        rows = np.unique(np.concatenate(list(map(swapped, seeds))))
-        return rows, unexchanged(model, pixels[rows], batch_size=batch_size)
+    tested = np.unique(np.concatenate(list(map(swapped, seeds))))  # whose encodings all seeds share
+    encoded = cache(partial(unexchanged, model, pixels[tested], batch_size=batch_size))
 
     def made(row: str, seed: int) -> FeatureScores:
         swap, truth, net = None, None, model if row == MODEL else None
@@ -254,9 +250,8 @@ def disentangle(
         if net is not None:
             chosen, known = swapped(seed), None
             if net is model:
-                rows, both = encoded()
-                places = np.searchsorted(rows, chosen)
-                known = tuple({key: each[places] for key, each in one.items()} for one in both)
+                places = np.searchsorted(tested, chosen)
+                known = [{key: each[places] for key, each in one.items()} for one in encoded()]
             swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size, known=known)
         if len(factors) >= 2:
             truth = ground_truth.ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
@@ -276,11 +271,8 @@ def disentangle(
     notes = [f"swap test: {tables[0].verdict(places.index(_SWAP))}"]
     notes += [f"swap test, decoded: {tables[0].verdict(places.index(_DECODED))}"]
     notes += [f"left out of the true factors: {name} ({why})" for name, why in unused.items()]
-    values = {
-        "pictures": len(images), "features": sizes, "seeds": list(seeds), "left_out": unused,
-        "rows": card.numbers(),
-    }  # fmt: skip
-    return Scores(tables, values, [*notes, kept.summary()], result=card)
+    values = {"pictures": len(images), "features": sizes, "seeds": list(seeds), "left_out": unused}
+    return Scores(tables, {**values, "rows": card.numbers()}, [*notes, kept.summary()], result=card)
 
 
 def swap_intervals(tests: Sequence[SwapScores]) -> dict[str, Interval]:
