@@ -6,7 +6,7 @@ convolution is linear in its kernel, so kernels can be combined or shifted befor
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import torch
 from jaxtyping import Float
@@ -105,12 +105,8 @@ class NarrowConv2d(nn.Conv2d):
         self.block = 4 if channels_out == 1 else 2
 
     def forward(self, input: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c2 h w"]:
-        last = self.block - 1
-        shifted = [
-            functional.pad(self.weight, (across, last - across, down, last - down))
-            for down in range(self.block)
-            for across in range(self.block)
-        ]
+        last, places = self.block - 1, product(range(self.block), repeat=2)
+        shifted = [functional.pad(self.weight, (x, last - x, y, last - y)) for y, x in places]
         kernel = torch.stack(shifted, dim=1).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         blocks = functional.conv2d(input, kernel, stride=self.block, padding=2)
         return functional.pixel_shuffle(blocks, self.block)
@@ -139,13 +135,11 @@ class ConfidenceNet(nn.Module):
         previous = 8 * width
         upsampling: list[nn.Module] = [nn.ConvTranspose2d(code, previous, 4, bias=False), nn.ReLU()]
         for stage in range(settings.stages - 2):
-            channels = max(4 * width // 2**stage, 2 * width)
-            upsampling += doubling(previous, channels)
-            previous = channels
+            before, previous = previous, max(4 * width // 2**stage, 2 * width)
+            upsampling += doubling(before, previous)
         self.trunk = nn.Sequential(*upsampling)
-        self.photometric_head = nn.Sequential(
-            *doubling(previous, width), *doubling(width, width), NarrowConv2d(width, 2)
-        )
+        twice = doubling(previous, width) + doubling(width, width)
+        self.photometric_head = nn.Sequential(*twice, NarrowConv2d(width, 2))
         self.perceptual_head = nn.Conv2d(previous, 2, 3, padding=1, bias=False)
         self.doublings = settings.doublings
 

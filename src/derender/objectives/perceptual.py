@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from derender.objectives.reconstruction import at_least_float32, bounded_sigma, masked_mean
+from derender.objectives.reconstruction import Mask, at_least_float32, bounded_sigma, masked_mean
 from derender.storage.tensors import check_fit, check_pickle, read_tensors, require_plain
 
 CALIBRATION_IMAGES = 256
@@ -27,7 +27,7 @@ WHERE_TO_GET_IT = (
 def perceptual_loss(
     prediction: Float[Tensor, "n c fh fw"],
     target: Float[Tensor, "n c fh fw"],
-    mask: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
+    mask: Mask,
     sigma: Float[Tensor, "n 1 sh sw"] | None,
 ) -> Float[Tensor, ""]:
     """``|df|^2 / (2 sigma^2) + log sigma`` with |df|^2 averaged over channels, weighted by the mask's share.

@@ -12,11 +12,13 @@ from torch import Tensor
 
 SIGMA_FLOOR = 1e-3
 
+Mask = Float[Tensor, "n h w"] | Bool[Tensor, "n h w"]
+
 
 def photometric_loss(
     prediction: Float[Tensor, "n c h w"],
     target: Float[Tensor, "n c h w"],
-    mask: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
+    mask: Mask,
     sigma: Float[Tensor, "n 1 h w"] | None,
 ) -> Float[Tensor, ""]:
     """Negative log-likelihood of a Laplace distribution around the prediction, averaged over the mask.
@@ -34,9 +36,7 @@ def photometric_loss(
 
 
 def masked_l1(
-    prediction: Float[Tensor, "n c h w"],
-    target: Float[Tensor, "n c h w"],
-    mask: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"],
+    prediction: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Mask
 ) -> Float[Tensor, ""]:
     """Mean absolute difference over channels and over the pixels that the mask keeps; 0 is best."""
     return photometric_loss(prediction, target, mask, None)
@@ -63,9 +63,7 @@ def depth_smoothness(
     return (rows + columns) / depth_range
 
 
-def masked_mean(
-    value: Float[Tensor, "n h w"], weight: Float[Tensor, "n h w"] | Bool[Tensor, "n h w"]
-) -> Float[Tensor, ""]:
+def masked_mean(value: Float[Tensor, "n h w"], weight: Mask) -> Float[Tensor, ""]:
     """Weighted mean over the whole batch; exactly 0, with zero gradient, where every weight is 0."""
     weight = weight.to(value.dtype)
     total = weight.sum()

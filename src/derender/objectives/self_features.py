@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64, UInt8
@@ -77,15 +78,12 @@ def trunk(widths: tuple[int, int, int], normalised: bool) -> nn.Sequential:
 def without_normalisation(normalised: nn.Sequential, widths: tuple[int, int, int]) -> nn.Sequential:
     """What the trained layers compute in evaluation mode, every BatchNorm folded into its convolution."""
     folded = trunk(widths, normalised=False)
-    layers = [layer for layer in normalised if not isinstance(layer, nn.BatchNorm2d)]
-    norms = (layer for layer in normalised if isinstance(layer, nn.BatchNorm2d))
-    for target, convolution in zip(folded, layers, strict=True):
-        if isinstance(target, nn.Conv2d) and isinstance(convolution, nn.Conv2d):
-            norm = next(norms)
-            assert norm.running_var is not None and norm.running_mean is not None and target.bias is not None
-            gain = norm.weight / (norm.running_var + norm.eps).sqrt()
-            target.weight.copy_(convolution.weight * gain.view(-1, 1, 1, 1))
-            target.bias.copy_(norm.bias - norm.running_mean * gain)
+    kinds = (folded, nn.Conv2d), (normalised, nn.Conv2d), (normalised, nn.BatchNorm2d)
+    rows: list[list[Any]] = [[layer for layer in layers if isinstance(layer, kind)] for layers, kind in kinds]
+    for target, convolution, norm in zip(*rows, strict=True):
+        gain = norm.weight / (norm.running_var + norm.eps).sqrt()
+        target.weight.copy_(convolution.weight * gain.view(-1, 1, 1, 1))
+        target.bias.copy_(norm.bias - norm.running_mean * gain)
     return folded
 
 
@@ -133,9 +131,8 @@ def train_self_features(
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
     learner = nn.Sequential(layers, head).to(images.device).train()
-    optimiser = torch.optim.AdamW(
-        learner.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
-    )
+    rate, decay = settings.learning_rate, settings.weight_decay
+    optimiser = torch.optim.AdamW(learner.parameters(), rate, weight_decay=decay)
 
     def loss(rows: Int64[Tensor, " b"]) -> Tensor:
         crops = images[rows].float() / 255

@@ -106,14 +106,9 @@ def operators(
         def made(
             suffix: str, tensors: Sequence[str], results: int, function: Operation, room: Operation
         ) -> Any:
-            several = ", ".join(["Tensor"] * results)
-            whole = f"derender::{name}_{backend}{suffix}"
-            schema = f"({', '.join(f'Tensor {one}' for one in tensors)}, float focal_px) -> "
-            torch.library.define(
-                whole,
-                schema + (several if results == 1 else f"({several})"),
-                tags=torch.Tag.pt2_compliant_tag,
-            )
+            takes, gives = ", ".join(f"Tensor {one}" for one in tensors), ", ".join(["Tensor"] * results)
+            whole, schema = f"derender::{name}_{backend}{suffix}", f"({takes}, float focal_px) -> ({gives})"
+            torch.library.define(whole, schema, tags=torch.Tag.pt2_compliant_tag)
             torch.library.impl(whole, devices)(function)
             torch.library.register_fake(whole, lambda *values: _one_or_all(room(*values[:-1])))
             return getattr(torch.ops.derender, f"{name}_{backend}{suffix}").default

@@ -75,19 +75,16 @@ def scattered_sums(
     ``targets``, in ``units`` (float64, one per image and target) where mode is ADD_INTEGERS; or raises
     ``largest`` (bits of float64) for MEASURE.
     """
-    largest = torch.zeros((len(like), len(shapes)), dtype=torch.int64, device=like.device)
+    largest = like.new_zeros((len(like), len(shapes)), dtype=torch.int64)
     units = torch.ones_like(largest, dtype=torch.float64)
     if not torch.are_deterministic_algorithms_enabled():
-        sums = [
-            torch.zeros(shape, dtype=dtype, device=like.device)
-            for shape, dtype in zip(shapes, dtypes, strict=True)
-        ]
+        sums = [like.new_zeros(shape, dtype=dtype) for shape, dtype in zip(shapes, dtypes, strict=True)]
         run(ADD, units, largest, sums)
         return sums
     run(MEASURE, units, largest, [largest] * len(shapes))
     most, pixels = largest.view(torch.float64), like.shape[-2] * like.shape[-1]
     units = torch.where(most > SMALLEST_SUMMAND, LARGEST_SUM / (pixels * most.clamp(min=SMALLEST_SUMMAND)), 0)
-    whole = [torch.zeros(shape, dtype=torch.int64, device=like.device) for shape in shapes]
+    whole = [like.new_zeros(shape, dtype=torch.int64) for shape in shapes]
     run(ADD_INTEGERS, units, largest, whole)
     sizes = torch.where(units > 0, 1 / units, most * 0)  # NaN if most is not finite
     return [

@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from derender.networks import FACTORS
-from derender.networks.factors import vector_net
+from derender.networks.factors import FACTORS, vector_net
 from derender.renderers.renderer import Renderer
 from derender.scene import Scene, environment
 from derender.scene.perturb import exchange

@@ -14,8 +14,7 @@ from pydantic import Field, field_validator
 
 from derender.data import suggestion
 from derender.model import load
-from derender.networks import Factor
-from derender.networks.factors import GEOMETRY_START
+from derender.networks.factors import GEOMETRY_START, Factor
 from derender.overrides import SHORT, settings_by_name, with_changes
 from derender.postprocess.fitting import FittingSettings
 from derender.presets import MODEL_PRESETS, ModelSettings, named_preset

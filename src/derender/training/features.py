@@ -19,8 +19,7 @@ from torch import Generator, Tensor
 
 from derender.data import Progress
 from derender.model import Derenderer
-from derender.postprocess import Features
-from derender.postprocess.embedding import HISTOGRAMS
+from derender.postprocess.embedding import HISTOGRAMS, Features
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings, MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
 from derender.scene.brightness import BrightnessPrior, brightness_cues
@@ -85,10 +84,9 @@ def fit_whitening(
 ) -> Whitening:  # fmt: skip
     """The map from a trained model's activations to its features; arguments as of `make_features`.
 
-    A framing network that the model has already is kept, where the settings ask for one.
-
-    ``size`` is that of the features, by default the code's. Fewer than two images, or activations that are
-    not finite, are a ValueError.
+    A framing network that the model has already is kept, where the settings ask for one. ``size`` is that of
+    the features, by default the code's. Fewer than two images, or activations that are not finite, are a
+    ValueError.
     """
     generator = Generator().manual_seed(seed)
     others = Generator().manual_seed(seed)  # of the vector factors: it changes no other feature
@@ -101,6 +99,7 @@ def fit_whitening(
         framing = framing or fit_framing(model, images, settings.framing, seed=seed, progress=progress)
     model = model.without_features().with_brightness(None)
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
+    names = [factor.name for factor in maps]
     gradients = settings.gradients and settings.spatial
     described = {f.name for f in maps if gradients and f.parameter == "albedo"}
     turns = settings.canonical and settings.spatial and "camera" in {f.parameter for f in vectors}
@@ -109,13 +108,9 @@ def fit_whitening(
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
         batch = batch if framing is None else framing(batch)
         seen = dict.fromkeys(turned, model.frontal(batch)) if turned else {}
-        return {
-            f.name: model.factor_activations(f.name, seen.get(f.name, batch), f.name in described)
-            for f in maps
-        }
+        return {n: model.factor_activations(n, seen.get(n, batch), n in described) for n in names}
 
     encode = activated if settings.spatial else model.encode
-    names = tuple(factor.name for factor in maps)
     mirrored: dict[str, list[Scatter]] = {}
     alone: dict[str, Scatter] = {}
     with evaluating(model):
@@ -147,13 +142,11 @@ def fit_whitening(
                 alone.setdefault(factor.name, Scatter()).add(torch.stack(codes))
     size = size or model.settings.network.code_size
     shrinkage, power = settings.shrinkage, settings.vector_power
-    projections = {
-        name: fit_side_by_side(own, settings.directions, shrinkage, size, settings.evenness)
-        for name, own in mirrored.items()
-    } | {
-        name: fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
-        for name, scatter in alone.items()
-    }
+    projections = {}
+    for name, own in mirrored.items():
+        projections[name] = fit_side_by_side(own, settings.directions, shrinkage, size, settings.evenness)
+    for name, scatter in alone.items():
+        projections[name] = fit_projection(scatter, len(scatter.mean), shrinkage, power=power)
     for name in turned:
         projections[name] = replace(projections[name], map=projections[name].map * TURNED_SHARE**0.5)
     mirrors = mirrored if settings.mirrored else ()

@@ -12,7 +12,7 @@ from functools import partial
 from itertools import count, groupby, takewhile
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,22 +23,11 @@ from derender.data import ImageSet, split_indices
 from derender.storage.atomic import DamageNoticed, atomic_file
 from derender.storage.folder import SplitRecord, write_split
 from derender.training import checkpoint, process, run_folder
+from derender.training import task as tasks
 from derender.training.batches import Reader, batches_of, random_stream
 from derender.training.distributed import Ranks, open_fabric
 from derender.training.faster import Replayed, compile_networks
-from derender.training.task import (
-    Progress,
-    Step,
-    StepLosses,
-    TrainingTask,
-    TrainResult,
-    compute_step,
-    network_precision,
-)
 from derender.training.watch import Finding, largest_gradients, not_finite
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard.writer import SummaryWriter
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
@@ -51,7 +40,7 @@ NOT_RECONSTRUCTION = ("l1", "loocc", "cycle")
 SampleSheet = Callable[[Any, Tensor], Image.Image]  # draws a model's output for a few images
 
 
-def train_task(task: TrainingTask, images: ImageSet, out: str | Path, **how: Any) -> TrainResult:
+def train_task(task: tasks.TrainingTask, images: ImageSet, out: str | Path, **how: Any) -> tasks.TrainResult:
     """Train any task; arguments, files and errors are those of `derender.training.train`."""
     images.require(10)
     with process.deterministic_algorithms(task.config.deterministic), process.locked(Path(out)):
@@ -64,8 +53,8 @@ class _Run:
     """A run in progress: everything that lasts from one step to the next."""
 
     def __init__(
-        self, task: TrainingTask, images: ImageSet, out: Path, *, resume: bool = False,
-        sample_sheet: SampleSheet | None = None, progress: Callable[[Progress], None] | None = None,
+        self, task: tasks.TrainingTask, images: ImageSet, out: Path, *, resume: bool = False,
+        sample_sheet: SampleSheet | None = None, progress: Callable[[tasks.Progress], None] | None = None,
         accelerator: str = "auto",
     ):  # fmt: skip
         config = self.config = task.config
@@ -85,15 +74,15 @@ class _Run:
         elif ranks.first:
             device = f"{ranks.count} x {fabric.device.type}" if ranks.count > 1 else str(fabric.device)
             run_folder.start_run(out, config, run_folder.describe_data(images, split), device)
-        phase = Progress.of("perceptual", self.report)
+        phase = tasks.Progress.of("perceptual", self.report)
         with fabric.rank_zero_first():
             losses = task.losses(self.model, self.folder, batches.sample(), phase)
         how = config.optimiser.model_dump(include={"betas", "weight_decay"})
         rate = config.optimiser.learning_rate
         on_gpu = fabric.device.type == "cuda"
         self.optimiser = torch.optim.Adam(_groups(self.model), rate, **how, fused=True, capturable=on_gpu)
-        self.module = fabric.setup_module(Step(self.model, losses))
-        self.precision = network_precision(config.precision, fabric.device)
+        self.module = fabric.setup_module(tasks.Step(self.model, losses))
+        self.precision = tasks.network_precision(config.precision, fabric.device)
         held_out = split.validation[:MAX_VALIDATION_IMAGES]
         self.held_rows = torch.from_numpy(held_out)
         self.held_out = torch.from_numpy(np.ascontiguousarray(images.images[held_out])).to(fabric.device)
@@ -114,7 +103,7 @@ class _Run:
             self.replayed = Replayed(partial(self.update, noise=self.noise), self.noise, self.note)
         self.uncompiled = config.compile == "auto" and ranks.count == 1 and not config.deterministic
         self.model_images: int | None = None
-        self.writer: "SummaryWriter | None" = None
+        self.writer: Any = None
         if ranks.first:
             run_folder.drop_metrics_after(self.folder, self.state.images)
             from torch.utils.tensorboard.writer import SummaryWriter
@@ -123,7 +112,7 @@ class _Run:
             if note is not None:
                 self.note(note)
 
-    def go_on(self) -> TrainResult:
+    def go_on(self) -> tasks.TrainResult:
         """Train from where the run stands until something ends it."""
         config, state = self.config, self.state
         began, images_before, seconds_before = time.perf_counter(), state.images, state.seconds
@@ -139,7 +128,7 @@ class _Run:
                 if steps % LOG_EVERY_STEPS == 1:
                     terms = self.ranks.mean(_on_host(result.terms))
                     self.log("train", {**terms, "images_per_second": speed, "waiting": waiting})
-                self.report(Progress("train", state.images, config.images, speed, terms, waiting))
+                self.report(tasks.Progress("train", state.images, config.images, speed, terms, waiting))
 
                 span = before, state.images
                 if self.position % READ_EVERY_STEPS and not self.due(*span, stop=signals.is_set()):
@@ -148,15 +137,13 @@ class _Run:
                 state.seconds = seconds_before + elapsed
                 self.read_notes()
                 stopped = self.why_stop()
-                if stopped == "collapse":
-                    break
-                healthy = self.watcher is None or not self.watcher.uneasy
+                healthy = stopped != "collapse" and (self.watcher is None or not self.watcher.uneasy)
                 ended = stopped is not None
                 if healthy and kept(*span, config.validate_every, ended=ended):
                     self.validate()
                     stopped = self.why_stop() or stopped
-                    if stopped == "collapse":
-                        break
+                if stopped == "collapse":
+                    break
                 if passed(*span, config.sample_every, ended=ended):
                     self.draw()
                 if interrupted or (healthy and kept(*span, config.checkpoint_every, ended=ended)):
@@ -173,7 +160,7 @@ class _Run:
         self.close()
         took = max(time.perf_counter() - began, 1e-9)
         speed, waiting = (state.images - images_before) / took, self.reader.waited_s / took
-        return TrainResult(
+        return tasks.TrainResult(
             self.folder.path, state.images, state.seconds, speed, self.validation, stopped or "images",
             self.findings, waiting, self.model_images,
         )  # fmt: skip
@@ -183,7 +170,7 @@ class _Run:
         """Batches that the weights have seen."""
         return self.state.images // self.config.batch_size
 
-    def step(self) -> StepLosses:
+    def step(self) -> tasks.StepLosses:
         """One batch: losses, gradients, update, watcher."""
         config, state = self.config, self.state
         position, done = self.position, state.images / config.images
@@ -213,20 +200,20 @@ class _Run:
     def trial(self, images: Tensor, done: float, rows: Tensor) -> float:
         """The loss of a batch; its gradients are computed, too, and change nothing."""
         noise = Generator(images.device if self.noise is not None else "cpu").manual_seed(0)
-        result = compute_step(self.module, images, noise, self.precision, done, rows)
+        result = tasks.compute_step(self.module, images, noise, self.precision, done, rows)
         self.fabric.backward(result.total)
         self.optimiser.zero_grad(set_to_none=True)
         return result.total.item()
 
     def update(
         self, images: Tensor, done: float, noise: Generator, rows: Tensor | None = None
-    ) -> tuple[tuple[StepLosses, list[str], list[str]], Tensor]:
+    ) -> tuple[tuple[tasks.StepLosses, list[str], list[str]], Tensor]:
         """Change the weights by a batch: its losses, names of gradients and stages, and notes of both.
 
         Nothing here waits for the device.
         """
         self.optimiser.zero_grad(set_to_none=True)  # a recording that failed may have left some
-        result = compute_step(self.module, images, noise, self.precision, done, rows)
+        result = tasks.compute_step(self.module, images, noise, self.precision, done, rows)
         self.fabric.backward(result.total)
         gradients, largest = largest_gradients(self.model)
         self.broken.copy_(torch.maximum(self.broken, 1 - largest.isfinite().all().float()))
@@ -295,8 +282,8 @@ class _Run:
                     break
                 seen += len(batch)
                 if position % self.ranks.count == self.ranks.rank:
-                    noise = random_stream(self.config.seed, "perturb", position)
-                    result = compute_step(self.module, batch.float() / 255, noise, self.precision, rows=rows)
+                    noise, images = random_stream(self.config.seed, "perturb", position), batch.float() / 255
+                    result = tasks.compute_step(self.module, images, noise, self.precision, rows=rows)
                     for name, value in _on_host(result.terms).items():
                         sums[name] += value * len(batch)
         means = {name: value / max(seen, 1) for name, value in self.ranks.sum(sums).items()}

@@ -18,15 +18,8 @@ from typing_extensions import TypedDict
 from derender.data import ImageSet, Split
 from derender.overrides import checked, settings_by_name
 from derender.settings import Settings
+from derender.storage import bounded
 from derender.storage.atomic import remove_abandoned, write_whole
-from derender.storage.bounded import (
-    LINES_LIMIT_BYTES,
-    first_line,
-    parse_json,
-    parse_yaml,
-    read_bounded,
-    read_text,
-)
 from derender.training.checkpoint import read_state
 from derender.training.config import TrainConfig, to_yaml, without_removed
 from derender.training.process import LOCK_FILE
@@ -136,7 +129,7 @@ def read_settings(
     if not file.is_file():
         raise FileNotFoundError(f"no settings in {file}: give a YAML file, such as a run's config.yaml")
     try:
-        tree = parse_yaml(read_text(file))
+        tree = bounded.parse_yaml(bounded.read_text(file))
         if not isinstance(tree, dict):
             raise ValueError("no settings by name")
     except ValueError as error:
@@ -170,16 +163,16 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         return []
     rows = []
     try:
-        lines = read_bounded(file, LINES_LIMIT_BYTES).splitlines(keepends=True)
+        lines = bounded.read_bounded(file, bounded.LINES_LIMIT_BYTES).splitlines(keepends=True)
     except ValueError as error:
         raise ValueError(f"{file} is damaged ({error}): move it away") from error
     for number, line in enumerate(lines, 1):
         try:
-            rows.append(dict(parse_json(line, MetricsRow)))
+            rows.append(dict(bounded.parse_json(line, MetricsRow)))
         except ValueError as error:
             if number == len(lines) and line[:1] == b"{" and line[-1:] != b"\n":  # cut off by a kill
                 break
-            where = f"line {number}: {first_line(error)}"
+            where = f"line {number}: {bounded.first_line(error)}"
             raise ValueError(f"{file} is damaged ({where}): delete that line") from error
     return rows
 
@@ -223,7 +216,7 @@ def describe_data(images: ImageSet, split: Split) -> dict[str, Any]:
 def _require_same(path: Path, data: dict[str, Any]) -> None:
     """A ValueError where a run recorded other images than ``data`` describe; old runs recorded less."""
     file = path / "environment.json"
-    stored = parse_json(read_text(file), dict[str, Any]) if file.is_file() else {}
+    stored = bounded.parse_json(bounded.read_text(file), dict[str, Any]) if file.is_file() else {}
     began = data | stored.get("data", {})
     same = all(began[key] == data[key] for key in ("layout", "pictures", "names"))
     if same and np.allclose(began["levels"], data["levels"], rtol=0, atol=1):  # decoders differ by less

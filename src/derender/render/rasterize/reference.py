@@ -82,9 +82,8 @@ def _covered(
         pixel_u = first_u[triangle] + within % columns[triangle]
         pixel_v = first_v[triangle] + within // columns[triangle]
         du, dv = u[triangle] - pixel_u[:, None], v[triangle] - pixel_v[:, None]
-        weight = (du.roll(-1, 1) * dv.roll(-2, 1) - du.roll(-2, 1) * dv.roll(-1, 1)) * (
-            1 / area[triangle, None]
-        )
+        scale = 1 / area[triangle, None]
+        weight = (du.roll(-1, 1) * dv.roll(-2, 1) - du.roll(-2, 1) * dv.roll(-1, 1)) * scale
         first, second, third = (weight * inverse_z[triangle]).unbind(-1)
         inverse_depth = first + second + third  # in this order, as in the fast versions
         inside = (weight >= -EDGE_TOLERANCE).all(-1) & (inverse_depth > 0)
@@ -104,8 +103,8 @@ def intersect(vertices: Tensor, triangle: Tensor, focal_px: float) -> tuple[Tens
     For the ray r = (r_x, r_y, 1) let q_k = (x_k, y_k) - (r_x, r_y) z_k. The weights w_k = q_i x q_j are the
     determinants [r, P_i, P_j]. So b = w / sum(w) are perspective-correct: r z = sum b_k P_k.
     """
-    count, height, width, _ = vertices.shape
-    image, v, u = (triangle >= 0).nonzero(as_tuple=True)
+    height, width = triangle.shape[1:]
+    image, v, u = seen = (triangle >= 0).nonzero(as_tuple=True)
     corners = triangle_corners(height, width, vertices.device)[triangle[image, v, u]]
     points = vertices.flatten(1, 2)[image[:, None], corners].double()
     ray_x, ray_y = (u.double() - (width - 1) / 2) / focal_px, (v.double() - (height - 1) / 2) / focal_px
@@ -116,7 +115,5 @@ def intersect(vertices: Tensor, triangle: Tensor, focal_px: float) -> tuple[Tens
     carried = torch.stack((corners % width, corners // width), -1).double()
     uv = (weight[..., None] * carried).sum(1).to(vertices.dtype)
     depth = (weight * points[..., 2]).sum(1).to(vertices.dtype)
-    return (
-        vertices.new_zeros(count, height, width, 2).index_put((image, v, u), uv),
-        vertices.new_zeros(count, height, width).index_put((image, v, u), depth),
-    )
+    blank = vertices.new_zeros(*triangle.shape, 2)
+    return blank.index_put(seen, uv), blank[..., 0].index_put(seen, depth)

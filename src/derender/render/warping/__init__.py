@@ -71,13 +71,12 @@ def _room(image: Tensor, depth: Tensor, rotation: Tensor, offset: Tensor) -> tup
     return image.new_empty(image.shape), *maps, depth.new_empty(depth.shape, dtype=torch.int32)
 
 
-def _triton(
-    image: Tensor, depth: Tensor, rotation: Tensor, offset: Tensor, focal: float
-) -> tuple[Tensor, ...]:
+def _triton(*values: Any) -> tuple[Tensor, ...]:
     from derender.render.warping import triton_kernels
 
-    outputs = _room(image, depth, rotation, offset)[:3]
-    image, depth, *motion = (value.contiguous() for value in (image, depth, rotation, offset))
+    *tensors, focal = values
+    outputs = _room(*tensors)[:3]
+    image, depth, *motion = (value.contiguous() for value in tensors)
     _, channels, height, width = image.shape
     bits, pixels = float64_bits(focal), height * width
     screen = tuple(torch.empty_like(depth, dtype=torch.float64) for _ in range(3))
