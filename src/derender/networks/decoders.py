@@ -114,14 +114,11 @@ class NarrowConv2d(nn.Conv2d):
 
 @dataclass(frozen=True)
 class Confidence:
-    """Standard deviations, positive, of the reconstruction and of its flipped twin.
+    """Standard deviations, positive, of the reconstruction and of its flipped twin."""
 
-    ``photometric`` are of colours, (N, 1, H, W), ``perceptual`` of perceptual features, (N, 1, H/4, W/4).
-    """
-
-    photometric: Float[Tensor, "n 1 h w"]
+    photometric: Float[Tensor, "n 1 h w"]  # of colours
     photometric_flip: Float[Tensor, "n 1 h w"]
-    perceptual: Float[Tensor, "n 1 h4 w4"]
+    perceptual: Float[Tensor, "n 1 h4 w4"]  # of perceptual features, at a quarter of the resolution
     perceptual_flip: Float[Tensor, "n 1 h4 w4"]
 
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, leaky_relu
@@ -21,6 +21,7 @@ IMAGE_SIZES = (32, 64, 128, 256)
 MAX_PLACES = 2048  # numbers of the last spatial map among the activations
 
 Images = Float[Tensor, "n 3 h w"]
+Pixels = UInt8[Tensor, "n 3 h w"]
 Code = Float[Tensor, "n code"]
 Spatial = Float[Tensor, "n channels y x"]
 
@@ -57,10 +58,8 @@ class NetworkSettings(Settings):
     def _grown(self) -> "NetworkSettings":
         smaller = IMAGE_SIZES[: IMAGE_SIZES.index(self.image_size)]
         if self.grown_from is not None and (self.grown_from not in smaller or self.encoder == "unet"):
-            raise ValueError(
-                f"grown_from must be an image size below {self.image_size} and the encoder conv, got "
-                f"{self.grown_from} and {self.encoder}"
-            )
+            wanted, got = f"an image size below {self.image_size}", f"{self.grown_from} and {self.encoder}"
+            raise ValueError(f"grown_from must be {wanted} and the encoder conv, got {got}")
         return self
 
     @property
@@ -108,10 +107,8 @@ class NormReLU(nn.GroupNorm):
 
 
 def activations(code: Code, spatial: Spatial) -> Float[Tensor, "n _"]:
-    """Encoder activations, one row per image: the code, then the last spatial map.
-
-    The map is averaged over 2x2 locations, then over all, where it holds more than 2,048 numbers.
-    """
+    """Encoder activations, one row per image: the code, then the last spatial map."""
+    # the map is averaged over 2x2 locations, then over all, where it holds more than 2,048 numbers
     side = spatial.shape[-1]
     while side > 1 and spatial.shape[1] * side**2 > MAX_PLACES:
         side //= 2
@@ -148,18 +145,16 @@ class UNetEncoder(nn.Module):
     def __init__(self, settings: NetworkSettings, code_size: int):
         super().__init__()
         widths = unet_widths(settings)
-        pairs = zip([3, *widths], widths, strict=False)
-        self.levels = nn.ModuleList(double_convolution(previous, channels) for previous, channels in pairs)
+        self.levels = nn.ModuleList(double_convolution(*pair) for pair in pairwise([3, *widths]))
         self.pool = nn.MaxPool2d(2)
         self.to_code = nn.Sequential(nn.Conv2d(widths[-1], code_size, 4, bias=False), nn.ReLU())
         self.code_size, self.widths = code_size, widths
 
     def skips(self, images: Images) -> list[Tensor]:
         """Features after each level, from full resolution down to 4x4, for a segmentation decoder."""
-        features, result = images * 2 - 1, []
-        for level, block in enumerate(self.levels):
-            features = block(features if level == 0 else self.pool(features))
-            result.append(features)
+        result = [self.levels[0](images * 2 - 1)]
+        for block in self.levels[1:]:
+            result.append(block(self.pool(result[-1])))
         return result
 
     def spatial(self, images: Images) -> Spatial:

@@ -35,16 +35,13 @@ class FactorNet(nn.Module):
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a factor: its name in reports, its range, and whether it is even in its logarithm.
-
-    ``start`` is the share of the range, between 0 and 1, at which an untrained network begins.
-    """
+    """One number of a factor: its name in reports, its range, and whether it is even in its logarithm."""
 
     name: str
     low: float
     high: float
     log: bool = False
-    start: float = 0.5
+    start: float = 0.5  # share of the range, between 0 and 1, at which an untrained network begins
 
     def at(self, share: Tensor) -> Tensor:
         """The value at shares of the range, 0..1."""
@@ -55,16 +52,14 @@ class Number:
 
 @dataclass(frozen=True)
 class Factor:
-    """One row: what the factor is called, how it is predicted, what it means and how it is perturbed.
-
-    ``perturb`` draws, for each row, another physically possible value; None if LOOCC never perturbs it.
-    """
+    """One row: what the factor is called, how it is predicted, what it means and how it is perturbed."""
 
     name: str  # key of the network and of the feature column
     parameter: str  # the field of `Scene` (or key of ``Scene.extra``) that it fills
     build: Callable[[NetworkSettings], FactorNet]  # makes the factor's network
     to_parameter: Callable[[Tensor, SceneRanges], Tensor]  # gives a raw network output its physical range
     mirrored: bool  # whether the parameter is a map that the flipped twin of a scene shows mirrored
+    # draws, for each row, another physically possible value; None if LOOCC never perturbs it
     perturb: Callable[[Tensor, Generator, PerturbSettings, SceneRanges], Tensor] | None
     numbers: tuple[Number, ...] = ()  # each column for reports and sliders; none of a map, no mirror changes
     rate: float = 1.0  # share of the learning rate at which its network is trained

@@ -21,6 +21,7 @@ from torch.serialization import safe_globals
 from derender.networks.decoders import ConfidenceNet
 from derender.networks.encoders import IMAGE_SIZES, NetworkSettings
 from derender.networks.factors import FACTORS
+from derender.storage.bounded import first_line
 from derender.storage.tensors import check_pickle, require_plain
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
@@ -49,9 +50,8 @@ def read_checkpoint(file: str | Path) -> tuple[NetworkSettings, dict[str, Tensor
         raise FileNotFoundError(f"{file} does not exist: give the .pth file that unsup3d wrote")
     content = _loaded(file)
     if not isinstance(content, Mapping):
-        raise ValueError(
-            f"{file} holds {type(content).__name__}, no checkpoint of unsup3d: expected netD and others"
-        )
+        kind = type(content).__name__
+        raise ValueError(f"{file} holds {kind}, no checkpoint of unsup3d: expected netD and others")
     theirs = {net: _tensors(content, net, file) for net in NETS}
     for net, tensors in theirs.items():
         if not tensors and net != OPTIONAL:
@@ -82,16 +82,13 @@ def _loaded(file: Path) -> Any:
             except pickle.UnpicklingError as error:
                 unknown = re.search(r"Unsupported global: GLOBAL (\S+) was", str(error))
                 if unknown is None:
-                    raise ValueError(
-                        f"{file} is damaged, no file of torch, or wants to run code when read: not opened"
-                    ) from error
+                    what = "is damaged, no file of torch, or wants to run code when read: not opened"
+                    raise ValueError(f"{file} {what}") from error
                 name = unknown[1] if "." in unknown[1] else f"builtins.{unknown[1]}"
                 known.enter_context(safe_globals([(Empty, name)]))
             except (RuntimeError, EOFError, ValueError, LookupError, TypeError, AttributeError) as error:
-                message = str(error).splitlines()[0] if str(error) else type(error).__name__
-                raise ValueError(
-                    f"{file} is damaged or no file of torch ({message}): download it again"
-                ) from error
+                why = f"is damaged or no file of torch ({first_line(error)}): download it again"
+                raise ValueError(f"{file} {why}") from error
     raise ValueError(f"{file} holds more than {MOST_UNKNOWN} kinds of objects: no checkpoint of unsup3d")
 
 
@@ -110,16 +107,11 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
     shapes = {net: [tuple(value.shape) for value in tensors.values()] for net, tensors in theirs.items()}
     light = shapes["netL"]
     try:
-        sizes: dict[str, Any] = {
-            "width": shapes["netD"][0][0],
-            "light_width": light[0][0],
-            "code_size": light[-1][1],
-            "image_size": 4 * 2 ** (len(light) - 2),
-        }
+        sizes: dict[str, Any] = {"width": shapes["netD"][0][0], "light_width": light[0][0]}
+        sizes |= {"code_size": light[-1][1], "image_size": 4 * 2 ** (len(light) - 2)}
         if shapes[OPTIONAL]:  # the first layer there that narrows is the one to the code
-            sizes["confidence_code_size"] = next(
-                shape[0] for shape in shapes[OPTIONAL] if len(shape) == 4 and shape[0] < shape[1]
-            )
+            narrowing = (one for one in shapes[OPTIONAL] if len(one) == 4 and one[0] < one[1])
+            sizes["confidence_code_size"] = next(narrowing)[0]
         if sizes["image_size"] not in IMAGE_SIZES:
             raise ValueError(f"light has {len(light)} layers")
         return NetworkSettings(**sizes)
@@ -130,18 +122,14 @@ def _sizes(theirs: Mapping[str, Mapping[str, Tensor]], file: Path) -> NetworkSet
 def _renamed(theirs: Mapping[str, Tensor], module: nn.Module, net: str, file: Path) -> dict[str, Tensor]:
     """The n-th tensor of the file under the name of the network's n-th."""
     result: dict[str, Tensor] = {}
-    expected = module.state_dict()
+    expected, other = module.state_dict(), "this is another architecture"
     for (name, value), (ours, like) in zip(theirs.items(), expected.items(), strict=False):
         if value.shape not in (like.shape, (*like.shape, 1, 1)):
-            raise ValueError(
-                f"{file}: {net} has {name} of shape {tuple(value.shape)} where {tuple(like.shape)} is "
-                f"expected (derender's {ours}): this is another architecture"
-            )
+            expect = f"{tuple(like.shape)} is expected (derender's {ours}): {other}"
+            raise ValueError(f"{file}: {net} has {name} of shape {tuple(value.shape)} where {expect}")
         if not bool(value.isfinite().all()):
             raise ValueError(f"{file}: {net} has {name} with NaN or infinite values: its training went wrong")
         result[f"nets.{NETS[net]}.{ours}"] = value.detach().reshape(like.shape).float()
     if len(theirs) != len(expected):
-        raise ValueError(
-            f"{file}: {net} has {len(theirs)} tensors, expected {len(expected)}: this is another architecture"
-        )
+        raise ValueError(f"{file}: {net} has {len(theirs)} tensors, expected {len(expected)}: {other}")
     return result
