@@ -94,11 +94,8 @@ def _anchor_losses(
 
 
 def _directions(codes: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Unit vectors, safe for any magnitude: each code is first divided by its largest entry, a constant.
-
-    NaN stays NaN: it must not pass for a code without a direction.
-    """
+    """Unit vectors, safe for any magnitude: each code is first divided by its largest entry, a constant."""
     largest = codes.detach().abs().amax(dim=1, keepdim=True)
-    has_direction = ~(largest <= _NO_DIRECTION)
+    has_direction = ~(largest <= _NO_DIRECTION)  # NaN stays NaN, and does not pass for a code without one
     codes = torch.where(has_direction, codes, 0.0) / torch.where(has_direction, largest, 1.0)
     return codes / torch.where(has_direction, codes, 1.0).norm(dim=1, keepdim=True)

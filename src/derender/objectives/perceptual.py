@@ -6,6 +6,7 @@ confidence terms mean the same whichever weights are used. Source of VGG16: Simo
 (configuration D), weights from disk. Leaves out self-supervised features (self_features.py) and downloading.
 """
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,8 @@ from derender.objectives.reconstruction import Mask, at_least_float32, bounded_s
 from derender.storage.tensors import check_fit, check_pickle, read_tensors, require_plain
 
 CALIBRATION_IMAGES = 256
-WHERE_TO_GET_IT = (
-    "save https://download.pytorch.org/models/vgg16-397923af.pth (torchvision's ImageNet weights, 528 MB) "
-    "in torch hub's cache, or anywhere and give its path"
-)
+WEIGHTS = "https://download.pytorch.org/models/vgg16-397923af.pth (torchvision's ImageNet weights, 528 MB)"
+WHERE_TO_GET_IT = f"save {WEIGHTS} in torch hub's cache, or anywhere and give its path"
 
 
 def perceptual_loss(
@@ -44,21 +43,16 @@ def perceptual_loss(
     if sigma is None:
         return masked_mean(squared, weight)
     if sigma.shape[-2:] != size:
-        raise ValueError(
-            f"the perceptual sigma must have the features' resolution {height} x {width}, got shape "
-            f"{tuple(sigma.shape)}; let the confidence net put out that size"
-        )
+        got = f"got shape {tuple(sigma.shape)}; let the confidence net put out that size"
+        raise ValueError(f"the perceptual sigma must have the features' resolution {height} x {width}, {got}")
     deviation = bounded_sigma(torch.where(kept, sigma, 1.0))[:, 0]
     return masked_mean(squared / (2 * deviation.square()) + deviation.log(), weight)
 
 
 class PerceptualFeatures(nn.Module):
-    """A frozen net from images in 0..1 to feature maps; always in evaluation mode, never trained further.
+    """A frozen net from images in 0..1 to feature maps; always in evaluation mode, never trained further."""
 
-    ``stride`` is the number of pixels per feature location.
-    """
-
-    stride: int
+    stride: int  # pixels per feature location
     channels: int
     scale: Tensor
     image_mean: Tensor
@@ -93,10 +87,9 @@ class PerceptualFeatures(nn.Module):
             square = square + features.square().sum(dim=(0, 2, 3))
         deviation = (square / count - (total / count).square()).clamp(min=0).mean().sqrt().item()
         if not 1e-8 < deviation < float("inf"):
-            raise ValueError(
-                f"the perceptual features do not vary over {len(images)} calibration images (standard "
-                f"deviation {deviation:g}); give images that differ, or check the weights"
-            )
+            over = f"{len(images)} calibration images (standard deviation {deviation:g})"
+            fix = "give images that differ, or check the weights"
+            raise ValueError(f"the perceptual features do not vary over {over}; {fix}")
         self.scale.fill_(1.0 / deviation)
         return self
 
@@ -112,13 +105,9 @@ class Vgg16Features(PerceptualFeatures):
 
     def __init__(self):
         layers: list[nn.Module] = []
-        channels = 3
-        for width in (64, 64, None, 128, 128, None, 256, 256, 256):
-            if width is None:
-                layers.append(nn.MaxPool2d(2))
-            else:
-                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
-                channels = width
+        for place, pair in enumerate(pairwise((3, 64, 64, 128, 128, 256, 256, 256))):
+            layers += [nn.Conv2d(*pair, 3, padding=1), nn.ReLU(inplace=True)]
+            layers += [nn.MaxPool2d(2)] if place in (1, 3) else []
         super().__init__(nn.Sequential(*layers), (0.485, 0.456, 0.406), (0.229, 0.224, 0.225))  # ImageNet's
 
 

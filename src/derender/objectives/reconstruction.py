@@ -55,10 +55,8 @@ def depth_smoothness(
         raise ValueError(f"depth_range must be above 0, got {depth_range}; give farthest minus nearest depth")
     depth = at_least_float32(depth[:, :, border : depth.shape[2] - border])
     if min(depth.shape[1:]) <= order:
-        raise ValueError(
-            f"depth {'smoothness' if order == 1 else 'curvature'} needs {order + 1} rows and {order + 1} "
-            f"columns inside the border, got {tuple(depth.shape)}"
-        )
+        what, size = "smoothness" if order == 1 else "curvature", f"{order + 1} rows and {order + 1} columns"
+        raise ValueError(f"depth {what} needs {size} inside the border, got {tuple(depth.shape)}")
     rows, columns = (depth.diff(n=order, dim=axis).abs().mean() for axis in (1, 2))
     return (rows + columns) / depth_range
 

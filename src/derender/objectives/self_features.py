@@ -9,6 +9,7 @@ al. 2020) at feature locations, as in DenseCL (Wang et al. 2021), between two cr
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from derender.objectives.loocc import nt_xent
 from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeatures
 from derender.storage.bounded import parse_json
 from derender.storage.tensors import read_described, write_tensors
+
+Images = Float[Tensor, "n 3 h w"]
 
 DEFAULT_WIDTHS = (16, 32, 64)
 KIND = "self"  # in a file's metadata
@@ -64,13 +67,11 @@ def trunk(widths: tuple[int, int, int], normalised: bool) -> nn.Sequential:
         raise ValueError(f"the self-trained features need three positive widths, got {widths}")
     full, half, quarter = widths
     layers: list[nn.Module] = []
-    previous = 3
-    for channels, pool in ((full, True), (half, False), (half, True), (quarter, False), (quarter, False)):
+    for place, (previous, channels) in enumerate(pairwise((3, full, half, half, quarter, quarter))):
         layers.append(nn.Conv2d(previous, channels, 3, padding=1, bias=not normalised))
         layers += [nn.BatchNorm2d(channels)] if normalised else []
         layers.append(nn.ReLU(inplace=True))
-        layers += [nn.AvgPool2d(2)] if pool else []
-        previous = channels
+        layers += [nn.AvgPool2d(2)] if place in (0, 2) else []
     return nn.Sequential(*layers)
 
 
@@ -146,10 +147,8 @@ def train_self_features(
         if progress is not None:
             progress(step, steps, value.item())
     if not all(bool(value.isfinite().all()) for value in layers.state_dict().values()):
-        raise ValueError(
-            f"learning perceptual features ended in weights that are NaN or infinite after {steps} steps: "
-            "give another seed, or perceptual=none"
-        )
+        ended = f"learning perceptual features ended in weights that are NaN or infinite after {steps} steps"
+        raise ValueError(f"{ended}: give another seed, or perceptual=none")
     net.features.load_state_dict(without_normalisation(layers.cpu().eval(), settings.widths).state_dict())
     rows = torch.randperm(len(images), generator=generator)[:CALIBRATION_IMAGES]
     net.calibrate_(images[rows].float() / 255)
@@ -192,20 +191,15 @@ def one_cycle(
 
 @dataclass(frozen=True)
 class ViewPair:
-    """Two augmented crops (N, 3, crop, crop) of each image, 0..1, and where they show the same points.
-
-    Entry p of ``first_places`` and ``second_places`` is one point, as a flat index into either's feature map.
-    """
+    """Two augmented crops (N, 3, crop, crop) of each image, 0..1, and where they show the same points."""
 
     first: Float[Tensor, "n 3 c c"]
     second: Float[Tensor, "n 3 c c"]
-    first_places: Int64[Tensor, "n p"]
+    first_places: Int64[Tensor, "n p"]  # of point p, as a flat index into that crop's feature map
     second_places: Int64[Tensor, "n p"]
 
 
-def two_views(
-    images: Float[Tensor, "n 3 h w"], crop: int, stride: int, places: int, generator: Generator
-) -> ViewPair:
+def two_views(images: Images, crop: int, stride: int, places: int, generator: Generator) -> ViewPair:
     """Crop each image twice, mirror both crops alike, augment each by itself.
 
     Crops take at most three quarters of the image's side and are up to a quarter of the crop apart, by whole
@@ -245,13 +239,9 @@ def two_views(
     return ViewPair(view(first_corner), view(second_corner), flat(first_cell), flat(second_cell))
 
 
-def photometric_augmentation(
-    images: Float[Tensor, "n 3 h w"], generator: Generator
-) -> Float[Tensor, "n 3 h w"]:
-    """Brightness, contrast, a colour cast and noise, drawn for each image; the result stays in 0..1.
-
-    There is no blur: features that ignore it would not miss the detail that a blurred rendering lacks.
-    """
+def photometric_augmentation(images: Images, generator: Generator) -> Images:
+    """Brightness, contrast, a colour cast and noise, drawn for each image; the result stays in 0..1."""
+    # no blur: features that ignore it would not miss the detail that a blurred rendering lacks
 
     def draw(channels: int = 1) -> Tensor:
         return torch.rand(len(images), channels, 1, 1, generator=generator).to(images)
