@@ -91,10 +91,7 @@ def unwarp(
 
 
 def _checked(depth: Tensor, **others: tuple[Tensor, int]) -> list[Tensor]:
-    """The tensors in float32 or float64, or an error that names the one that does not fit ``depth``.
-
-    Light and camera have so many numbers, the others so many maps.
-    """
+    """The tensors in float32 or float64, or an error that names the one that does not fit ``depth``."""
     if depth.dim() != 3:
         raise ValueError(f"render: depth must have shape (N, H, W), got {tuple(depth.shape)}")
     count, *size = depth.shape
@@ -104,7 +101,7 @@ def _checked(depth: Tensor, **others: tuple[Tensor, int]) -> list[Tensor]:
     for name, value in values.items():
         if not value.is_floating_point():
             raise ValueError(f"render: {name} must be floating point, got {value.dtype}; use .float()")
-        vector = name in ("light", "camera")
+        vector = name in ("light", "camera")  # of so many numbers; the others are so many maps
         shape = (count, *(() if name == "depth" else others[name][1:]), *(() if vector else size))
         if tuple(value.shape) != shape:
             raise ValueError(f"render: {name} must have shape {shape} to fit depth, got {tuple(value.shape)}")

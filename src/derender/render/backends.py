@@ -52,16 +52,13 @@ def chosen_backend(device: torch.device | str, backend: str = "auto", pixels: fl
     if backend == "reference":
         return backend
     if not INSTALLED[backend]:
-        raise ValueError(
-            f"the {backend} render backend needs the package {backend}; install it or use 'reference'"
-        )
+        lacks = f"the {backend} render backend needs the package {backend}"
+        raise ValueError(f"{lacks}; install it or use 'reference'")
     if kind != WORKS_ON[backend] and not (backend == "triton" and interpreted()):
         where = "the CPU" if backend == "numba" else "a CUDA device"
         slowly = ", or set TRITON_INTERPRET=1 before Python starts to try it on the CPU, slowly"
-        raise ValueError(
-            f"the {backend} render backend works on {where}, the tensors are on {kind}; use 'auto'"
-            + slowly * (backend == "triton")
-        )
+        wrong = f"the {backend} render backend works on {where}, the tensors are on {kind}"
+        raise ValueError(f"{wrong}; use 'auto'{slowly * (backend == 'triton')}")
     return backend
 
 

@@ -63,10 +63,7 @@ def choose_numba(screen: Tensor) -> Tensor:
 
 
 def mark_triangles(screen: Sequence[Tensor]) -> Tensor:
-    """The same on a CUDA device, from u, v and inverse depth; NO_TRIANGLE where there is none.
-
-    The kernel that reads this map next replaces the mark.
-    """
+    """The same on a CUDA device, from u, v and inverse depth; NO_TRIANGLE, for its reader, where is none."""
     from derender.render.rasterize import triton_kernels
 
     _, height, width = screen[0].shape

@@ -46,10 +46,8 @@ def corners(triangle, width):
 def choose(
     us, vs, inverse_zs, nearest_bits, nearest, first, height, width, SECOND: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """First walk: raise ``nearest`` at every pixel a triangle covers. Second: lower ``first`` where tied.
-
-    ``nearest_bits`` (int64, zeros before) and ``nearest`` (float64) are the same memory.
-    """
+    """First walk: raise ``nearest`` at every pixel a triangle covers. Second: lower ``first`` where tied."""
+    # nearest_bits (int64, zeros before) and nearest (float64) are the same memory
     image, triangle, live = lanes(2 * (height - 1) * (width - 1), BLOCK)
     base = image * height * width
     i0, j0, i1, j1, i2, j2 = corners(triangle, width)

@@ -55,9 +55,8 @@ def backward(
     """Write derivatives by albedo and slopes, and each program's part (5) of those by the lamp."""
     n, pixel, live = lanes(height * width, BLOCK)
     focal = float64(focal_bits).to(depth.dtype.element_ty)
-    facing, x, y, z, length, light_x, light_y, light_z, u, v = cosine(
-        depth, lamp, n, pixel, live, focal, height, width
-    )
+    seen = cosine(depth, lamp, n, pixel, live, focal, height, width)
+    facing, x, y, z, length, light_x, light_y, light_z, u, v = seen
     diffuse, lit = tl.load(lamp + n * 5 + 1), tl.maximum(facing, 0.0)
     shading = tl.load(lamp + n * 5) + diffuse * lit
     by_shading = facing * 0

@@ -46,12 +46,10 @@ def reference(
 
 
 def sample(image: Tensor, uv: Tensor, mask: Tensor) -> Tensor:
-    """The image (N, C, H, W) at pixel coordinates (N, H2, W2, 2), bilinear; 0, no gradient where mask is 0.
-
-    Beyond the border, which `rasterize` may exceed by its edge tolerance, the border cell is continued.
-    """
+    """An image (N, C, H, W) at pixel coordinates (N, H2, W2, 2), bilinear; 0, no gradient where mask is 0."""
     count, channels, height, width = image.shape
     uv = torch.where(mask[..., None] > 0, uv, 0)
+    # beyond the border, which `rasterize` may exceed by its edge tolerance, the border cell is continued
     left = uv[..., 0].detach().floor().clamp(0, width - 2)
     top = uv[..., 1].detach().floor().clamp(0, height - 2)
     across, down = (uv[..., 0] - left)[:, None], (uv[..., 1] - top)[:, None]

@@ -14,10 +14,8 @@ from derender.render.triton_parts import accumulate, float64, kernel, lanes, mag
 
 @kernel
 def cell(u, v, height, width):
-    """Row and column of the cell that holds (u, v), border cells continued, and where in it the point lies.
-
-    Coordinates are clipped before they become integers: a NaN must not become an address.
-    """
+    """Row and column of the cell that holds (u, v), the border's continued, and the point's place in it."""
+    # coordinates are clipped before they become integers: a NaN must not become an address
     j = tl.where(u > 0, tl.minimum(u, width - 2), 0.0).to(tl.int32)
     i = tl.where(v > 0, tl.minimum(v, height - 2), 0.0).to(tl.int32)
     return i, j, u - j, v - i
