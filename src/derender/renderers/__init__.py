@@ -70,15 +70,11 @@ def recorded_renderer(stored: str, given: str | Render | None, source: str | Pat
         return replace(given, name=stored)  # a user's own value, which knows no module
     asked = given.name if isinstance(given, Renderer) else given
     if isinstance(asked, str) and asked != stored:
-        raise ValueError(
-            f"{source} was made with the renderer {stored!r}, not {asked!r}: leave the renderer out, or "
-            "train a model with it"
-        )
+        fix = "leave the renderer out, or train a model with it"
+        raise ValueError(f"{source} was made with the renderer {stored!r}, not {asked!r}: {fix}")
     if brings_code(stored) and given is None and not Path(source).exists():  # of no bundled model either
-        raise ValueError(
-            f"{source} was downloaded and wants the code of the renderer {stored!r}: if you trust that code, "
-            f"use derender.load({str(source)!r}, renderer={stored!r})"
-        )
+        fix = f"if you trust that code, use derender.load({str(source)!r}, renderer={stored!r})"
+        raise ValueError(f"{source} was downloaded and wants the code of the renderer {stored!r}: {fix}")
     return as_renderer(given, stored)
 
 
@@ -87,10 +83,8 @@ def _one(name: str, settings: str | None) -> Renderer:
     if brings_code(name):
         return _imported(name, settings)
     if name not in RENDERERS:
-        raise ValueError(
-            f"no renderer {name!r}{suggestion(name, RENDERERS)}: choose one of {', '.join(RENDERERS)}, or "
-            "package.module:thing"
-        )
+        fix = f"choose one of {', '.join(RENDERERS)}, or package.module:thing"
+        raise ValueError(f"no renderer {name!r}{suggestion(name, RENDERERS)}: {fix}")
     make, given = RENDERERS[name], dict[str, Any]()
     known = inspect.signature(make).parameters
     for item in filter(str.strip, (settings or "").split(",")):
@@ -116,10 +110,8 @@ def _imported(name: str, settings: str | None) -> Renderer:
     try:
         result = getattr(importlib.import_module(module), thing)
     except (Exception, SystemExit) as error:  # whatever a module does when it is imported
-        raise ValueError(
-            f"no renderer {name!r} ({error!r}): put the folder of {module.partition('.')[0]} on PYTHONPATH, "
-            "or install it"
-        ) from error
+        fix = f"put the folder of {module.partition('.')[0]} on PYTHONPATH, or install it"
+        raise ValueError(f"no renderer {name!r} ({error!r}): {fix}") from error
     if not isinstance(result, Renderer):
         raise ValueError(f"{name!r} is a {type(result).__name__}, not a derender.renderers.Renderer")
     return replace(result, name=name)

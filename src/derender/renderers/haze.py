@@ -11,7 +11,7 @@ from torch import Tensor
 
 from derender.networks.factors import Number, numbers_factor
 from derender.render import Rendering
-from derender.renderers.renderer import Renderer
+from derender.renderers.renderer import Maps, Renderer
 from derender.scene import Scene
 
 HAZE = numbers_factor("haze", Number("beta", 0.2, 4.0, log=True), Number("airlight", 0.25, 1.0))
@@ -31,9 +31,7 @@ def through_haze(rendering: Rendering, scene: Scene) -> Rendering:
     return Rendering(image, rendering.depth, rendering.mask)
 
 
-def transmission(
-    depth: Float[Tensor, "n h w"], mask: Float[Tensor, "n h w"], beta: Float[Tensor, " n"]
-) -> Float[Tensor, "n h w"]:
+def transmission(depth: Maps, mask: Maps, beta: Float[Tensor, " n"]) -> Maps:
     """The share of light that passes: 1 at the nearest point seen, exp(-beta) at the farthest."""
     seen = mask > 0
     near = torch.where(seen, depth, torch.inf).amin(dim=(1, 2), keepdim=True)
@@ -42,5 +40,5 @@ def transmission(
     return (-beta[:, None, None] * distance).exp()
 
 
-def _map(scene: Scene, fov_deg: float) -> Float[Tensor, "n h w"]:
+def _map(scene: Scene, fov_deg: float) -> Maps:
     return transmission(scene.depth, torch.ones_like(scene.depth), scene.extra["haze"][:, 0])

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from derender.render import chosen_backend
-from derender.renderers.renderer import Renderer
+from derender.renderers.renderer import Maps, Renderer
 from derender.scene import Scene
 from derender.scene.camera import focal_px
 from derender.scene.light import light_direction
@@ -36,9 +36,7 @@ def _visibility(softness_deg: float, scene: Scene, fov_deg: float) -> Tensor:
     return visible(scene.depth, scene.light, fov_deg, softness_deg)
 
 
-def visible(
-    depth: Float[Tensor, "n h w"], light: Float[Tensor, "n 4"], fov_deg: float, softness_deg: float = 5.0
-) -> Float[Tensor, "n h w"]:
+def visible(depth: Maps, light: Float[Tensor, "n 4"], fov_deg: float, softness_deg: float = 5.0) -> Maps:
     """The share of the directional light that reaches each point, 0..1, with gradients to depth and light."""
     towards = -light_direction(light.to(depth.dtype))
     with torch.no_grad():
@@ -54,7 +52,7 @@ def visible(
 
 
 def clearance(
-    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], places: Places,
+    depth: Maps, towards: Float[Tensor, "n 3"], places: Places,
     step: Int32[Tensor, " m"] | Float[Tensor, " m"], focal: float,
 ) -> Float[Tensor, " m"]:  # fmt: skip
     """How far some pixels' rays run in front of the surface after so many steps, over the distance gone.
@@ -87,9 +85,7 @@ def _along(
     return gone, 1 - gone * z, j + gone * right, i + gone * down
 
 
-def _lowest_step(
-    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], focal: float
-) -> Int32[Tensor, "n h w"]:
+def _lowest_step(depth: Maps, towards: Float[Tensor, "n 3"], focal: float) -> Int32[Tensor, "n h w"]:
     """The step at which each ray runs deepest below the surface for its distance; 0 if it never does."""
     step, lowest = torch.zeros_like(depth, dtype=torch.int32), torch.zeros_like(depth)
     nearest, size = depth.amin(dim=(1, 2)), (depth.shape[1], depth.shape[2])

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from derender.networks.factors import Number, numbers_factor
-from derender.renderers.renderer import Renderer
+from derender.renderers.renderer import Maps, Renderer
 from derender.scene import Scene
 from derender.scene.camera import to_canonical, unproject
 from derender.scene.light import light_direction
@@ -59,5 +59,5 @@ def _penalty(mean_diffuse: float, scene: Scene, shading: Tensor) -> Tensor:
     return mean_diffuse * (shading.mean(dim=(1, 2, 3)) - 0.5).square().mean()
 
 
-def _map(scene: Scene, fov_deg: float) -> Float[Tensor, "n h w"]:
+def _map(scene: Scene, fov_deg: float) -> Maps:
     return highlight(scene, normals_from_depth(scene.depth, fov_deg), fov_deg)[:, 0]

@@ -21,6 +21,8 @@ from derender.render.shading import shade as lambert
 from derender.scene import Scene
 from derender.scene.normals import normals_from_depth
 
+Maps = Float[Tensor, "n h w"]
+
 STAGES = ("visibility", "irradiance", "specular", "atmosphere")
 DARKEST = 1e-6  # under a root: its slope is infinite at 0
 
@@ -70,10 +72,8 @@ class Renderer:
             rendering = self.atmosphere(rendering, scene)
         staged = any(getattr(self, stage) is not None for stage in STAGES)
         if staged and not _finite(rendering.image) and all(map(_finite, scene.parameters.values())):
-            raise ValueError(
-                f"the renderer {self.name!r} makes NaN or infinity of finite scenes: look for a division by "
-                "0, or a root or logarithm of negative values, in its stages"
-            )
+            fix = "look for a division by 0, or a root or logarithm of negative values, in its stages"
+            raise ValueError(f"the renderer {self.name!r} makes NaN or infinity of finite scenes: {fix}")
         return rendering
 
     def shade(self, scene: Scene, fov_deg: float, backend: str = "auto") -> Float[Tensor, "n 3 h w"]:
@@ -123,10 +123,8 @@ class Renderer:
             if value is None and row.name in {one.name for one in FACTORS}:
                 continue  # the scene was given the paper's own parameter
             if value is None:
-                raise ValueError(
-                    f"the renderer {self.name!r} needs the scene's {row.parameter!r}, this scene has "
-                    f"{', '.join(scene.parameters)}: it is of a model with another renderer"
-                )
+                has = f"this scene has {', '.join(scene.parameters)}: it is of a model with another renderer"
+                raise ValueError(f"the renderer {self.name!r} needs the scene's {row.parameter!r}, {has}")
             if not row.numbers or value.device.type != "cpu" or not len(value):  # elsewhere it would wait
                 continue
             if value.ndim != 2 or value.shape[1] != len(row.numbers):
@@ -136,10 +134,9 @@ class Renderer:
             for number, least, most in ends:
                 slack = 1e-4 * (number.high - number.low)
                 if least < number.low - slack or most > number.high + slack:
-                    raise ValueError(
-                        f"{row.name} {number.name} must lie in {number.low:g}..{number.high:g} for the "
-                        f"renderer {self.name!r}, got {least if least < number.low else most:g}"
-                    )
+                    what = f"{row.name} {number.name} must lie in {number.low:g}..{number.high:g}"
+                    got = least if least < number.low else most
+                    raise ValueError(f"{what} for the renderer {self.name!r}, got {got:g}")
 
     def __add__(self, other: "Renderer") -> "Renderer":
         """The stages and factors of both; where both set the same one, a ValueError."""

@@ -44,9 +44,8 @@ def _lit(channels: int, scene: Scene, normal: Tensor) -> Tensor:
 
 def _ball(channels: int, scene: Scene, fov_deg: float) -> Tensor:
     """A white ball in the light, as large as the image."""
-    height, width = scene.depth.shape[1:]
-    y = torch.linspace(-1, 1, height, device=scene.depth.device)[:, None].expand(height, width)
-    x = torch.linspace(-1, 1, width, device=scene.depth.device).expand(height, width)
+    lines = (torch.linspace(-1, 1, size, device=scene.depth.device) for size in scene.depth.shape[1:])
+    y, x = torch.meshgrid(*lines, indexing="ij")
     inside = 1 - x * x - y * y
     normal = torch.stack([-x, -y, inside.clamp(min=0).sqrt()], dim=-1)
     return (_lit(channels, scene, normal.expand(len(scene), -1, -1, -1)) * (inside > 0)).expand(-1, 3, -1, -1)

@@ -12,11 +12,10 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from derender.render.numba_threads import array, kernel, over_images
+from derender.renderers.renderer import Maps
 
 
-def lowest_step(
-    depth: Float[Tensor, "n h w"], towards: Float[Tensor, "n 3"], focal: float
-) -> Int32[Tensor, "n h w"]:
+def lowest_step(depth: Maps, towards: Float[Tensor, "n 3"], focal: float) -> Int32[Tensor, "n h w"]:
     """The step of the smallest clearance; 0 where it is nowhere below 0."""
     step = torch.empty(depth.shape, dtype=torch.int32)
     over_images(_search, len(depth), array(depth), array(towards), focal, array(step))
@@ -61,10 +60,8 @@ def _search(depth, towards, focal, step, first, last):
 
 @kernel
 def _nearest_ahead(own, source_u, source_v, ahead):
-    """Write for each pixel the smallest depth of all that lie further from the source in rows and columns.
-
-    Seen by the camera, parallel rays run away from the point that they come from.
-    """
+    """Write for each pixel the smallest depth of all that lie further from the source in rows and columns."""
+    # seen by the camera, parallel rays run away from the point that they come from
     height, width = own.shape
     for k in range(height):
         i = k
