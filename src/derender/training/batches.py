@@ -14,6 +14,9 @@ from derender.data.source import evenly_spaced
 from derender.training.config import LoopSettings
 from derender.training.distributed import ALONE, Ranks
 
+Stored = UInt8[np.ndarray, "n 3 h w"]
+Rows = Int64[np.ndarray, " k"]
+
 SAMPLED = 65_536  # images of a memory-mapped set that represent all of them where a few suffice
 
 _STREAMS = {"order": 1, "flip": 2, "perturb": 3}
@@ -36,14 +39,12 @@ class Batches:
     batch_size: int  # images in every batch; at most as many as there are
     seed: int  # of the order and the flips
     horizontal_flips: bool  # each image is mirrored with probability one half
-    rows: Int64[np.ndarray, " k"] | None = None
+    rows: Rows | None = None
 
     def __post_init__(self) -> None:
         if self.batch_size > len(self):
-            raise ValueError(
-                f"batch_size {self.batch_size} is more than the {len(self)} training images: "
-                f"set batch_size={max(2, len(self) // 2)} or bring more images"
-            )
+            more = f"batch_size {self.batch_size} is more than the {len(self)} training images"
+            raise ValueError(f"{more}: set batch_size={max(2, len(self) // 2)} or bring more images")
 
     def __len__(self) -> int:
         return len(self.images) if self.rows is None else len(self.rows)
@@ -84,10 +85,7 @@ class Batches:
         return batch
 
 
-def batches_of(
-    images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"], config: LoopSettings,
-    device: torch.device,
-) -> Batches:  # fmt: skip
+def batches_of(images: Stored, rows: Rows, config: LoopSettings, device: torch.device) -> Batches:
     """Batches of these rows: on the device, or left in the file where they lie mapped and train on a CPU."""
     stay = isinstance(images, np.memmap) and device.type == "cpu"
     lying = torch.from_numpy(images if stay else np.ascontiguousarray(images[rows])).to(device)
@@ -95,21 +93,17 @@ def batches_of(
     return Batches(lying, *how, rows if stay else None)
 
 
-def some_of(
-    images: UInt8[np.ndarray, "n 3 h w"], rows: Int64[np.ndarray, " k"], *, mapped: bool
-) -> UInt8[np.ndarray, "m 3 h w"]:
+def some_of(images: Stored, rows: Rows, *, mapped: bool) -> UInt8[np.ndarray, "m 3 h w"]:
     """These images in memory; of a mapped set at most ``SAMPLED``, evenly spread."""
     return np.ascontiguousarray(images[rows[evenly_spaced(len(rows), SAMPLED)] if mapped else rows])
 
 
 class Reader:
-    """Takes batches in order; on a CPU the next one is read in a thread while the present one is computed.
-
-    ``waited_s`` are the seconds spent waiting for images, of all batches so far.
-    """
+    """Takes batches in order; on a CPU the next one is read in a thread while the present one is computed."""
 
     def __init__(self, batches: Batches, ranks: Ranks = ALONE):
-        self.batches, self.ranks, self.waited_s = batches, ranks, 0.0
+        self.batches, self.ranks = batches, ranks
+        self.waited_s = 0.0  # spent waiting for images, of all batches so far
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="batch")
         self._next: dict[int, Future[Tensor]] = {}
 

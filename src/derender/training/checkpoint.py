@@ -29,21 +29,16 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")  # Adam's
 
 @dataclass
 class TrainState:
-    """Counters of a run; with the weights and the optimiser they determine everything that follows.
-
-    ``images`` and ``seconds`` count the run so far. The lowest validation loss is None before the first
-    validation; then come the number of validations since, and the state of the collapse detector. Whether
-    networks are compiled is None where that was never asked for.
-    """
+    """Counters of a run so far; with the weights and the optimiser they determine everything that follows."""
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
 
     images: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     seconds: Annotated[float, Field(allow_inf_nan=False)] = 0.0
-    best_loss: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    best_loss: Annotated[float, Field(allow_inf_nan=False)] | None = None  # None before the first validation
     validations_since_best: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
-    watcher: dict[str, Any] = field(default_factory=dict)
-    compiled: bool | None = None
+    watcher: dict[str, Any] = field(default_factory=dict)  # the state of the collapse detector
+    compiled: bool | None = None  # whether networks are; None where that was never asked for
 
     def ended_by(self, config: Any) -> str | None:
         """The setting that lets a run with these counters train no further, if there is one."""
@@ -63,10 +58,9 @@ class DamagedCheckpoint(Damaged):
     """A file of a checkpoint is cut off, changed or missing; ``reason`` says which and how."""
 
     def __init__(self, folder: Path, reason: str):
-        super().__init__(
-            f"the checkpoint {folder} is damaged ({reason}), and there is no whole one before it: delete "
-            f"{folder.parent} to begin this run again with --resume, or train in another folder"
-        )
+        what = f"the checkpoint {folder} is damaged ({reason}), and there is no whole one before it"
+        fix = f"delete {folder.parent} to begin this run again with --resume, or train in another folder"
+        super().__init__(f"{what}: {fix}")
         self.reason = reason
 
 
@@ -122,15 +116,12 @@ def read_state(folder: Path) -> TrainState:
 def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optimizer | None) -> TrainState:
     """Put a checkpoint's weights into ``model`` and its state into ``optimiser``; give back the counters.
 
-    Raises:
-        FileNotFoundError: there is none.
-        DamagedCheckpoint: a file of it is cut off, changed or missing.
-        ValueError: it is of another model, or of a newer version.
+    A FileNotFoundError: there is none; a DamagedCheckpoint: a file of it is cut off, changed or missing; a
+    ValueError: it is of another model, or of a newer version.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(
-            f"no checkpoint in {folder}: train without --resume, or give the run's own folder"
-        )
+        fix = "train without --resume, or give the run's own folder"
+        raise FileNotFoundError(f"no checkpoint in {folder}: {fix}")
     try:
         stored = parse_json(read_bounded(folder / STATE_FILE), _StateFile)
         version = stored.format
@@ -150,10 +141,8 @@ def load_checkpoint(folder: Path, model: nn.Module, optimiser: torch.optim.Optim
         if optimiser is not None:
             _fit_moments(optimiser, moments)
     except (ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"the checkpoint {folder} is of another model ({first_line(error)}): "
-            "resume with the settings it was made with, or train in another folder"
-        ) from error
+        why, fix = first_line(error), "resume with the settings it was made with, or train in another folder"
+        raise ValueError(f"the checkpoint {folder} is of another model ({why}): {fix}") from error
     return state
 
 
@@ -164,10 +153,7 @@ def fit_weights(module: nn.Module, weights: Mapping[str, Tensor]) -> None:
 
 
 def _fit_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]) -> None:
-    """Give the optimiser a stored state, with the strides of its parameters; how it steps stays its own.
-
-    A state of other parameters is a ValueError: a fused step goes by their size alone.
-    """
+    """Give the optimiser a stored state, with the strides of its parameters; how it steps stays its own."""
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     result: dict[int, dict[str, Tensor]] = {}
     for key, value in moments.items():
@@ -180,7 +166,7 @@ def _fit_moments(optimiser: torch.optim.Optimizer, moments: Mapping[str, Tensor]
         own = parameters[index]
         for name, value in entries.items():
             wanted = torch.Size() if name == "step" else own.shape
-            if value.shape != wanted:
+            if value.shape != wanted:  # a fused step goes by the parameter's size alone
                 raise ValueError(f"{index}.{name} has shape {tuple(value.shape)}, expected {tuple(wanted)}")
         step = entries["step"].to(own.device, torch.float32)
         likened = {name: torch.empty_like(own).copy_(entries[name]) for name in _MOMENTS}

@@ -30,11 +30,9 @@ def loocc_factors(kind: str, factors: Iterable[Factor]) -> list[Factor]:
     asked = {"none": (), "all": able}.get(kind, kind.split("+"))
     for name in asked:
         if name not in able:
-            raise ValueError(
-                f"setting 'objective.loocc': {name!r} is no factor that this model perturbs"
-                f"{suggestion(name, able)}: write none, all, or some of {', '.join(able)} joined by +, such "
-                "as light+camera"
-            )
+            what = f"setting 'objective.loocc': {name!r} is no factor that this model perturbs"
+            fix = f"write none, all, or some of {', '.join(able)} joined by +, such as light+camera"
+            raise ValueError(f"{what}{suggestion(name, able)}: {fix}")
     return [factor for name, factor in able.items() if name in asked]
 
 
@@ -219,10 +217,8 @@ def resolve(preset: str, overrides: Iterable[str] = (), **explicit: Any) -> Trai
             row = row.model_copy(update={"model": model.grown(size), "maps_only": True})
             config = with_changes(row, overrides, **explicit)
         if config.model.renderer != model.renderer:
-            raise ValueError(
-                f"cannot start from {config.start_from}: it was made with the renderer {model.renderer!r}, "
-                f"not {config.model.renderer!r}"
-            )
+            made = f"it was made with the renderer {model.renderer!r}, not {config.model.renderer!r}"
+            raise ValueError(f"cannot start from {config.start_from}: {made}")
     loocc_factors(config.objective.loocc, renderer_named(config.model.renderer).all_factors)
     return config
 
@@ -244,8 +240,6 @@ def without_removed(tree: dict[str, Any]) -> dict[str, Any]:
         part = tree.get(parents[0]) if parents else tree
         value = part.pop(last, neutral) if isinstance(part, dict) else neutral
         if value != neutral and neutral is not ...:
-            raise ValueError(
-                f"setting {key!r} no longer exists: it can be {neutral}, not {SHORT.repr(value)}; use an "
-                "earlier version of derender"
-            )
+            fix = f"it can be {neutral}, not {SHORT.repr(value)}; use an earlier version of derender"
+            raise ValueError(f"setting {key!r} no longer exists: {fix}")
     return tree

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from torch import Generator, Tensor
 
 from derender.data import ImageSet, split_indices
 from derender.model import Derenderer, load
+from derender.networks.encoders import Pixels
 from derender.networks.factors import GEOMETRY_START
 from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeatures, load_vgg16
 from derender.objectives.self_features import load_self_features, train_self_features
@@ -76,7 +76,10 @@ class DerenderTask(TrainingTask):
     replayable: ClassVar[bool] = True
 
     def shared(self, ranks: Ranks) -> "DerenderTask":
-        ranks.check(self.config.batch_size)
+        size, count = self.config.batch_size, ranks.count
+        if size % count:
+            fix = f"set batch_size={max(size // count, 1) * count}, or start another number of them"
+            raise ValueError(f"batch_size {size} cannot be shared evenly by {count} processes: {fix}")
         return replace(self, ranks=ranks)
 
     def phase(self, done: float) -> float | None:
@@ -106,20 +109,17 @@ class DerenderTask(TrainingTask):
                 raise ValueError(f"cannot start from {start}: {why}") from error
         return model.with_features(Features(self.whitening))
 
-    def losses(
-        self, model: Derenderer, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-    ) -> Losses:
-        """Those of `training_step`; perceptual features are learnt first where the run has none yet.
-
-        Held-out images are each judged by one of the ``ranks``.
-        """
+    def losses(self, model: Derenderer, run: RunFolder, images: Pixels, progress: PhaseProgress) -> Losses:
+        """Those of `training_step`; perceptual features are learnt first where the run has none yet."""
         objective, chunks = self.config.objective, self.config.accumulate
         perceptual = perceptual_of(self.config, run, images, progress)
 
         def step(
             batch: Tensor, generator: Generator, precision: Precision, done: float | None = None, *_: Any
         ) -> StepResult:
-            own, ranks = (1.0, ALONE) if done is None else (own_share(objective, done), self.ranks)
+            own, ranks = 1.0, ALONE  # held-out images are each judged by one rank
+            if done is not None:
+                own, ranks = own_share(objective, done), self.ranks
             how = generator, precision, own, ranks, chunks
             return training_step(model, batch, objective, perceptual, *how)
 
@@ -136,9 +136,7 @@ def require_perceptual(objective: ObjectiveSettings) -> None:
         load_vgg16(objective.vgg16_path)
 
 
-def self_features_of(
-    config: Any, file: Path, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-) -> PerceptualFeatures:
+def self_features_of(config: Any, file: Path, images: Pixels, progress: PhaseProgress) -> PerceptualFeatures:
     """Self-trained features from a run's file, or learnt from its images, again where it is damaged."""
     if file.exists():
         try:
@@ -153,7 +151,7 @@ def self_features_of(
 
 
 def perceptual_of(
-    config: TrainConfig, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
+    config: TrainConfig, run: RunFolder, images: Pixels, progress: PhaseProgress
 ) -> PerceptualFeatures | None:
     """The perceptual features of a run, None without weight; self-trained ones are kept in its folder."""
     objective = config.objective

@@ -22,6 +22,7 @@ from torch import Generator, Tensor, nn
 
 from derender.data import Progress, as_float
 from derender.model import Derenderer
+from derender.networks.encoders import Images, Pixels
 from derender.networks.factors import Number
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_features import one_cycle
@@ -32,7 +33,7 @@ from derender.scene.scene import seen_in_mirror
 from derender.settings import Settings
 from derender.training.config import FeatureSettings
 from derender.training.features import make_features
-from derender.training.step import fill_uncovered
+from derender.training.step import fill_uncovered, where_rows
 from derender.training.views import batches
 
 MEASURED_IMAGES = 256  # images on which standard deviations and errors are measured
@@ -57,10 +58,8 @@ class StudentSettings(Settings):
         for step, _ in one_cycle(optimiser, loss, count, batch, steps, generator, **how):
             report(min(step * batch, self.images), self.images)
         if not all(bool(value.isfinite().all()) for value in student.state_dict().values()):
-            raise ValueError(
-                f"{what} ended in weights that are NaN or infinite after {self.images:,} images: "
-                "give another seed or a lower learning_rate"
-            )
+            ended = f"{what} ended in weights that are NaN or infinite after {self.images:,} images"
+            raise ValueError(f"{ended}: give another seed or a lower learning_rate")
 
 
 class RefiningSettings(StudentSettings):
@@ -77,16 +76,13 @@ class RefiningSettings(StudentSettings):
 
 
 class RefineConfig(FeatureSettings):
-    """All settings of `derender refine`; ``perturb`` is also how far its renderings differ.
-
-    ``reframe`` are the crops of ``refining.reframed``; the student's camera gets the room that they need.
-    """
+    """All settings of `derender refine`; ``perturb`` is also how far its renderings differ."""
 
     refining: RefiningSettings = RefiningSettings()
     perturb: PerturbSettings = PerturbSettings(
         ambient=1, diffuse=1, light_deg=90, camera_pitch_deg=30, camera_yaw_deg=60
     )
-    reframe: crop.CropSettings = crop.DEFAULT_CROPS
+    reframe: crop.CropSettings = crop.DEFAULT_CROPS  # of refining.reframed; the camera gets room for them
 
 
 @dataclass(frozen=True)
@@ -99,7 +95,7 @@ class Student:
 
 
 def refine(
-    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], held_out: UInt8[Tensor, "m 3 h w"],
+    model: Derenderer, images: Pixels, held_out: UInt8[Tensor, "m 3 h w"],
     config: RefineConfig | None = None, *, seed: int = 0, progress: Progress | None = None,
 ) -> Student:  # fmt: skip
     """A copy of a trained model that predicts what fitting finds; the model stays as it is.
@@ -115,10 +111,9 @@ def refine(
     settings = config.refining
     maps = model.features.required_fitting().maps
     if len(images) < 2 or not len(held_out) or images.shape[-1] != model.image_size:
-        raise ValueError(
-            f"refining needs 2 images or more of {model.image_size} pixels and one held out, got "
-            f"{len(images)} of {images.shape[-1]} and {len(held_out)}"
-        )
+        wanted = f"2 images or more of {model.image_size} pixels and one held out"
+        got = f"{len(images)} of {images.shape[-1]} and {len(held_out)}"
+        raise ValueError(f"refining needs {wanted}, got {got}")
     generator = Generator().manual_seed(seed)
     rows = torch.randperm(len(images), generator=generator)[: settings.fitted]
     fitted = fit_scenes(model, images[rows], settings.fit_steps, report)
@@ -139,13 +134,10 @@ def refine(
 
 @dataclass(frozen=True)
 class FittedScenes:
-    """Fitted scenes, compact; ``error`` is each image's remaining one.
+    """Fitted scenes, compact."""
 
-    ``values`` are parameters of the scene by name, each with N rows, but coordinates of depth and albedo.
-    """
-
-    values: Mapping[str, Tensor]
-    error: Float[Tensor, " n"]
+    values: Mapping[str, Tensor]  # parameters of the scene, each with N rows, but coordinates of its maps
+    error: Float[Tensor, " n"]  # each image's remaining one
 
     def rows(self, rows: Tensor | slice) -> "FittedScenes":
         """Some of the scenes."""
@@ -163,9 +155,7 @@ class FittedScenes:
         return Scene.from_parameters({**self.values, **fitted, "albedo": fitted["albedo"].clamp(0, 1)})
 
 
-def fit_scenes(
-    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int, report: Progress
-) -> FittedScenes:
+def fit_scenes(model: Derenderer, images: Pixels, steps: int, report: Progress) -> FittedScenes:
     """Scenes fitted to all images, batch by batch."""
     model = model.with_brightness(None)  # coordinates are of albedos as decoded
     parts: list[dict[str, Tensor]] = []
@@ -178,7 +168,7 @@ def fit_scenes(
 
 
 def _learn(
-    student: Derenderer, images: UInt8[Tensor, "n 3 h w"], maps: MorphableMaps, fitted: FittedScenes,
+    student: Derenderer, images: Pixels, maps: MorphableMaps, fitted: FittedScenes,
     config: RefineConfig, generator: Generator, report: Progress,
 ) -> None:  # fmt: skip
     """Train the student's networks of all factors in place."""
@@ -208,9 +198,8 @@ def _learn(
 
 @torch.no_grad()
 def examples(
-    model: Derenderer, images: Float[Tensor, "n 3 h w"], fitted: Scene, config: RefineConfig,
-    generator: Generator,
-) -> tuple[Float[Tensor, "n 3 h w"], Scene]:  # fmt: skip
+    model: Derenderer, images: Images, fitted: Scene, config: RefineConfig, generator: Generator
+) -> tuple[Images, Scene]:
     """A batch to learn from, and its scenes: renderings first, then images, half of them mirrored."""
     settings, ranges = config.refining, model.settings.ranges
     rendered = round(len(images) * settings.rendered)
@@ -232,15 +221,14 @@ def examples(
     mirrored = torch.rand(len(shown), generator=generator) < (0.5 if known else 0)
     mirrored[:rendered] = False  # their light and view are any already
     twin = seen_in_mirror(scene, even).parameters if known else scene.parameters
-    both = {name: _where(mirrored, twin[name], value) for name, value in scene.parameters.items()}
-    shown, scene = _where(mirrored, shown.flip(-1), shown), Scene.from_parameters(both)
+    both = {name: where_rows(mirrored, twin[name], value) for name, value in scene.parameters.items()}
+    shown, scene = where_rows(mirrored, shown.flip(-1), shown), Scene.from_parameters(both)
     return _cropped(shown, scene, model, config, generator)
 
 
 def _cropped(
-    images: Float[Tensor, "n 3 h w"], scene: Scene, model: Derenderer, config: RefineConfig,
-    generator: Generator,
-) -> tuple[Float[Tensor, "n 3 h w"], Scene]:  # fmt: skip
+    images: Images, scene: Scene, model: Derenderer, config: RefineConfig, generator: Generator
+) -> tuple[Images, Scene]:
     """Images and their scenes, a share of both in other crops."""
     settings = config.refining
     if not settings.reframed:
@@ -248,12 +236,9 @@ def _cropped(
     crops = crop.random_crops(len(images), generator, config.reframe, settings.reframed)
     strange = torch.rand(len(images), generator=generator) < settings.strange
     surroundings = crop.other_surroundings(images, generator)
-    shown = _where(strange, crop.crop_images(images, crops, surroundings), crop.crop_images(images, crops))
+    other = crop.crop_images(images, crops, surroundings)
+    shown = where_rows(strange, other, crop.crop_images(images, crops))
     return shown, crop.crop_scene(scene, crops, model.settings.ranges.fov_deg)
-
-
-def _where(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    return torch.where(rows.to(one.device).view(-1, *[1] * (one.ndim - 1)), one, other)
 
 
 class SceneUnit:
@@ -302,7 +287,7 @@ def _mean_deviation(value: Float[Tensor, "n ..."], numbers: Sequence[Number] = (
 
 @torch.no_grad()
 def _compared(
-    model: Derenderer, student: Derenderer, images: UInt8[Tensor, "n 3 h w"], steps: int
+    model: Derenderer, student: Derenderer, images: Pixels, steps: int
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     model, student = model.with_brightness(None), student.with_brightness(None)
     shown = as_float(images).to(model.device)

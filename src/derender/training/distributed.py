@@ -34,14 +34,6 @@ class Ranks:
         """Whether this process writes files and prints."""
         return self.rank == 0
 
-    def check(self, batch_size: int) -> None:
-        """Every rank gets the same number of images, or ValueError."""
-        if batch_size % self.count:
-            raise ValueError(
-                f"batch_size {batch_size} cannot be shared evenly by {self.count} processes: set "
-                f"batch_size={max(batch_size // self.count, 1) * self.count}, or start another number of them"
-            )
-
     def own(self, whole: Shaped[Tensor, "n ..."]) -> Shaped[Tensor, "m ..."]:
         """This rank's rows of a batch."""
         share = len(whole) // self.count
@@ -137,9 +129,7 @@ def open_fabric(accelerator: str) -> Any:
 
 def first_to_fail() -> bool:
     """Whether no other process of this run has failed before: the others then end silently; asked once."""
-    if started_together() == 1 or not distributed.is_available():
-        return True
-    if not distributed.is_initialized():
+    if started_together() == 1 or not (distributed.is_available() and distributed.is_initialized()):
         return this_rank_writes()  # before they know of each other all fail alike
     return distributed.distributed_c10d._get_default_store().add("derender/failed", 1) == 1
 

@@ -25,13 +25,9 @@ def compile_networks(
 ) -> bool:
     """Compile a model's networks in place if steps are faster with it, or as ``wanted``; whether they are.
 
-    Args:
-        step: losses and gradients of one batch, to the loss; it changes no weights.
-        report: is given a sentence once both ways were timed.
-        wanted: what a resumed run began with; None decides.
-
-    Raises:
-        ValueError: compiled networks are wanted, and this machine cannot compile.
+    ``step`` computes losses and gradients of one batch, to the loss, and changes no weights; ``report`` is
+    given a sentence once both ways were timed. ``wanted`` is what a resumed run began with; None decides. A
+    ValueError: compiled networks are wanted, and this machine cannot compile.
     """
     if wanted is False:
         return False
@@ -83,11 +79,9 @@ def _timed(step: Callable[[], float]) -> tuple[float, float]:
 class Replayed:
     """A training step that is replayed from some call on, if that is faster.
 
-    Args:
-        update: the step: images (N, 3, H, W) of a batch and the share of the run that is done, to its result
-            and a tensor of notes. It never waits for the device, and draws from ``noise`` alone.
-        noise: a generator on the device, seeded anew before each call.
-        report: is given a sentence once both ways were timed.
+    ``update`` is the step: images (N, 3, H, W) of a batch and the share of the run that is done, to its
+    result and a tensor of notes. It never waits for the device, and draws from ``noise`` alone, a generator
+    on the device, seeded anew before each call. ``report`` is given a sentence once both ways were timed.
     """
 
     def __init__(
@@ -103,10 +97,7 @@ class Replayed:
         self._calls, self._seconds = 0, [0.0, 0.0]
 
     def __call__(self, images: Tensor, done: float, phase: Any) -> tuple[Any, Tensor]:
-        """Result and notes of a step; a graph is recorded for each ``phase``, none for None.
-
-        The next replay overwrites the result, not the notes.
-        """
+        """Result and notes of a step; a graph is recorded for each ``phase``, none for None."""
         usual = torch.cuda.current_stream(images.device)
         self._stream.wait_stream(usual)
         with torch.cuda.stream(self._stream):
@@ -152,7 +143,7 @@ class Replayed:
         self._images.copy_(images)
         self._graph.replay()
         result, notes = self._kept
-        return result, notes.clone()
+        return result, notes.clone()  # the next replay overwrites the result
 
     def _leave(self, why: str) -> None:
         self._graph, self._kept, self._wanted = None, None, False

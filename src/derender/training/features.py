@@ -49,14 +49,11 @@ def make_features(
     size, fitting = model.settings.network.code_size, settings.fitting
     model = model.with_features(Features(model.whitening)).with_brightness(None)
     if fitting.steps and (size := size - fitting.coordinates) < 1:
-        raise ValueError(
-            f"{fitting.coordinates} fitted coordinates leave none of a feature's "
-            f"{size + fitting.coordinates} numbers to activations: set coordinates lower"
-        )
+        none = f"none of a feature's {size + fitting.coordinates} numbers to activations"
+        raise ValueError(f"{fitting.coordinates} fitted coordinates leave {none}: set coordinates lower")
     if settings.whitening.pictures >= 2:
-        whitening = fit_whitening(
-            model, images, settings.whitening, settings.perturb, size=size, seed=seed, progress=progress
-        )
+        how = settings.whitening, settings.perturb
+        whitening = fit_whitening(model, images, *how, size=size, seed=seed, progress=progress)
         model = model.with_features(Features(whitening))
     if fitting.examples >= 2 and PARAMETERS.keys() <= {factor.name for factor in model.factors}:
         made = make_fitting(model, images, fitting, seed=seed, progress=progress, maps=maps)
@@ -205,7 +202,5 @@ def _check_finite(what: str, values: Mapping[str, Tensor], start: int) -> None:
     """NaN or infinity in a batch is an error that names it and its images."""
     for name, value in values.items():
         if not bool(value.isfinite().all()):
-            raise ValueError(
-                f"{what}: NaN or infinity in {name} of images {start} to {start + len(value) - 1} of the "
-                "random subset: the model's training went wrong"
-            )
+            which = f"images {start} to {start + len(value) - 1} of the random subset"
+            raise ValueError(f"{what}: NaN or infinity in {name} of {which}: the model's training went wrong")

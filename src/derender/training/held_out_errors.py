@@ -102,21 +102,15 @@ def percentile_of(errors: Float[np.ndarray, " n"], held_out: HeldOutErrors) -> F
 def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     """What images that a model reconstructs badly have in common: their number, and the model that fits.
 
-    Args:
-        images: (N, 3, S, S) all of them.
-        percentiles: of the N errors among the model's held-out ones.
-
-    Returns:
-        One line; empty where no more images are out-of-distribution than among held-out ones.
+    One line of all images (N, 3, S, S), by the ``percentiles`` of their errors among the model's held-out
+    ones; empty where no more of them are out-of-distribution than among held-out ones.
     """
     odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
     if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):
         return ""
     which = "the image is" if len(percentiles) == 1 else f"{len(odd):,} of {len(percentiles):,} images are"
-    line = (
-        f"{which} reconstructed worse than {OUTLIER_PERCENTILE:g} % of those this model was validated on: "
-        "another kind of object, or another crop (derender align, --frame)"
-    )
+    worse = f"{which} reconstructed worse than {OUTLIER_PERCENTILE:g} % of those this model was validated on"
+    line = f"{worse}: another kind of object, or another crop (derender align, --frame)"
     return "; ".join(filter(None, (line, fitting_better(images[odd]))))
 
 

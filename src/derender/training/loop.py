@@ -150,9 +150,8 @@ class _Run:
                     self.checkpoint()
                 if interrupted and stopped is None:
                     self.close()
-                    raise process.TrainingInterrupted(
-                        f"stopped after {state.images:,} images and saved; the same with --resume continues"
-                    )
+                    done = f"stopped after {state.images:,} images and saved"
+                    raise process.TrainingInterrupted(f"{done}; the same with --resume continues")
         if stopped == "collapse":
             self.log("collapse", {finding.sign: finding.text for finding in self.findings})
         elif self.ranks.first:
@@ -208,10 +207,8 @@ class _Run:
     def update(
         self, images: Tensor, done: float, noise: Generator, rows: Tensor | None = None
     ) -> tuple[tuple[tasks.StepLosses, list[str], list[str]], Tensor]:
-        """Change the weights by a batch: its losses, names of gradients and stages, and notes of both.
-
-        Nothing here waits for the device.
-        """
+        """Change the weights by a batch: its losses, names of gradients and stages, and notes of both."""
+        # nothing here waits for the device
         self.optimiser.zero_grad(set_to_none=True)  # a recording that failed may have left some
         result = tasks.compute_step(self.module, images, noise, self.precision, done, rows)
         self.fabric.backward(result.total)
@@ -349,10 +346,8 @@ class _Run:
 
 
 def _groups(model: Any) -> list[dict[str, Any]]:
-    """Parameters in their order; networks of a renderer's few numbers have their own rate, without decay.
-
-    Their gradients are small beside the decay: it would carry their weights to 0.
-    """
+    """Parameters in their order; networks of a renderer's few numbers have their own rate, without decay."""
+    # their gradients are small beside the decay: it would carry their weights to 0
     rows = [row for row in getattr(model, "factors", ()) if row.numbers]
     rates = {id(parameter): row.rate for row in rows for parameter in model.nets[row.name].parameters()}
     return [

@@ -69,9 +69,8 @@ def refuse_taken(path: Path) -> None:
     for entry in path.iterdir() if path.is_dir() else [path]:
         empty = entry.name == "samples" and entry.is_dir() and not any(entry.iterdir())
         if not empty and not entry.name.startswith(_BEGUN):
-            raise FileExistsError(
-                f"{path} exists and is not empty: add --resume to continue that run, or choose another --out"
-            )
+            fix = "add --resume to continue that run, or choose another --out"
+            raise FileExistsError(f"{path} exists and is not empty: {fix}")
 
 
 def reopen_run(path: Path, config: Settings, data: dict[str, Any]) -> RunFolder:
@@ -83,16 +82,13 @@ def reopen_run(path: Path, config: Settings, data: dict[str, Any]) -> RunFolder:
     stored, asked = map(settings_by_name, both)
     for key in {**stored, **asked}:
         if key.partition(".")[0] not in _MAY_CHANGE_ON_RESUME and asked.get(key) != stored.get(key):
-            raise ValueError(
-                f"{path} was trained with another {key} ({stored.get(key)}, now {asked.get(key)}): "
-                "resume with the same settings, or start a new run in another folder"
-            )
+            other = f"{path} was trained with another {key} ({stored.get(key)}, now {asked.get(key)})"
+            raise ValueError(f"{other}: resume with the same settings, or start a new run in another folder")
     changed = [key for key in asked if key != "keep" and asked[key] != stored.get(key)]
     if changed and (end := (state := read_state(run.last)).ended_by(config)):
-        raise ValueError(
-            f"{path} has seen {state.images:,} images and would train no further ({end}={asked[end]}), so "
-            f"another {changed[0]} has no effect: raise {end}, or resume with the run's own settings"
-        )
+        what = f"{path} has seen {state.images:,} images and would train no further ({end}={asked[end]})"
+        fix = f"raise {end}, or resume with the run's own settings"
+        raise ValueError(f"{what}, so another {changed[0]} has no effect: {fix}")
     _require_same(path, data)
     for written in (run.last, run.best, run.model, run.config, run.metrics, run.perceptual):
         remove_abandoned(written)

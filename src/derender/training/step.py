@@ -10,12 +10,13 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Generator, Tensor
 from torch.utils.checkpoint import checkpoint
 
 from derender.model import Derenderer
 from derender.networks.decoders import Confidence
+from derender.networks.encoders import Images
 from derender.objectives.loocc import loocc_loss
 from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
 from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss
@@ -26,20 +27,17 @@ from derender.training.config import ObjectiveSettings, loocc_factors
 from derender.training.distributed import ALONE, Ranks
 from derender.training.task import Precision, StepLosses
 
+Codes = Mapping[str, Float[Tensor, "n _"]]
 Columns = Mapping[str, Shaped[Tensor, "n ..."]]
 
 
 @dataclass(frozen=True)
 class StepResult(StepLosses):
-    """Losses of one batch, and the values that the watcher looks at.
+    """Losses of one batch, weighted but the plain masked L1 ("l1"), and the values the watcher looks at."""
 
-    ``terms`` are every weighted term of the total and the plain masked L1 ("l1"). ``scene`` and ``rendering``
-    are without the twins. ``codes``, by factor, have gradient, for an objective beside this one.
-    """
-
-    scene: Scene
+    scene: Scene  # without the twins, as the rendering is
     rendering: Rendering
-    codes: dict[str, Tensor]
+    codes: dict[str, Tensor]  # by factor, with gradient, for an objective beside this one
     confidence: Confidence | None
 
     def stages(self) -> dict[str, Tensor]:
@@ -55,17 +53,15 @@ class StepResult(StepLosses):
 
 
 def training_step(
-    model: Derenderer, images: Float[Tensor, "n 3 h w"], objective: ObjectiveSettings,
+    model: Derenderer, images: Images, objective: ObjectiveSettings,
     perceptual: PerceptualFeatures | None, generator: Generator, precision: Precision = nullcontext,
     own: float = 1.0, ranks: Ranks = ALONE, chunks: int = 1,
 ) -> StepResult:  # fmt: skip
     """Losses for one batch of images in 0..1; networks run under ``precision``, geometry in float32.
 
-    Args:
-        images, generator: this rank's rows of the batch; of the perturbations, in one state on every rank.
-        own: each image's share in its maps (`own_share`).
-        ranks: those that share the batch; the mean of their terms is the batch's.
-        chunks: number of chunks in which networks and renderer work, to save memory.
+    ``images`` are this rank's rows of the batch; ``generator``, of the perturbations, is in one state on
+    every rank. ``own`` is each image's share in its maps (`own_share`). The mean of the terms of all
+    ``ranks`` is the batch's. Networks and renderer work in so many ``chunks``, to save memory.
     """
     count = images.shape[0]
 
@@ -86,9 +82,8 @@ def training_step(
     if objective.loocc != "none":
         perturbed, left_out = perturb_one_factor(model, scene, objective, generator, ranks)
         scenes.append(perturbed)
-    rendered = in_chunks(
-        lambda rows: vars(model.render(Scene.from_parameters(rows))), Scene.joined(scenes).parameters, chunks
-    )
+    joined = Scene.joined(scenes).parameters
+    rendered = in_chunks(lambda rows: vars(model.render(Scene.from_parameters(rows))), joined, chunks)
     image, mask = rendered["image"], rendered["mask"]
     straight, twin = image[:count], image[count : 2 * count]
     covered = mask[:count] * mask[count : 2 * count]
@@ -140,8 +135,7 @@ def perturb_one_factor(
     of the model that can be perturbed.
     """
     factors = loocc_factors(objective.loocc, model.factors)
-    names = [factor.name for factor in model.factors]
-    indices = [names.index(factor.name) for factor in factors]
+    indices = [model.factors.index(factor) for factor in factors]
     chosen = ranks.own(choose_factors(len(scene) * ranks.count, indices, generator))
     chosen = chosen.to(scene.depth.device, non_blocking=True)
     changed = {}
@@ -149,26 +143,25 @@ def perturb_one_factor(
         assert factor.perturb is not None
         value = scene.parameters[factor.parameter]
         drawn = factor.perturb(ranks.gather(value), generator, objective.perturb, model.settings.ranges)
-        rows = (chosen == index).view(-1, *[1] * (value.ndim - 1))
-        changed[factor.parameter] = torch.where(rows, ranks.own(drawn), value)
+        changed[factor.parameter] = where_rows(chosen == index, ranks.own(drawn), value)
     return scene.with_parameters(**changed), chosen
 
 
-def fill_uncovered(
-    rendered: Float[Tensor, "n 3 h w"], mask: Float[Tensor, "n h w"], images: Float[Tensor, "n 3 h w"]
-) -> Float[Tensor, "n 3 h w"]:
-    """Give pixels that nothing covers the mean colour of the image's edge.
+def where_rows(rows: Bool[Tensor, " n"], one: Tensor, other: Tensor) -> Tensor:
+    """One tensor's rows where ``rows`` is true, else the other's."""
+    return torch.where(rows.to(one.device).view(-1, *[1] * (one.ndim - 1)), one, other)
 
-    Left black, they would show an encoder how far the camera was turned, which no real image does.
-    """
+
+def fill_uncovered(rendered: Images, mask: Float[Tensor, "n h w"], images: Images) -> Images:
+    """Give pixels that nothing covers the mean colour of the image's edge."""
+    # left black, they would show an encoder how far the camera was turned, which no real image does
     edge = torch.cat([images[..., 0], images[..., -1], images[:, :, 0]], dim=-1)
     return torch.where(mask[:, None] > 0, rendered, edge.mean(dim=-1)[:, :, None, None])
 
 
 def cycle_loss(
-    model: Derenderer, codes_again: dict[str, Float[Tensor, "n _"]], rendered: Scene,
-    objective: ObjectiveSettings,
-) -> Float[Tensor, ""]:  # fmt: skip
+    model: Derenderer, codes_again: Codes, rendered: Scene, objective: ObjectiveSettings
+) -> Float[Tensor, ""]:
     """How far light and camera, predicted from a rendering, are from those it was rendered with; best 0.
 
     Mean absolute difference (radians, intensities, scene units) over the perturbed vector factors. The
@@ -193,28 +186,20 @@ def in_chunks(function: Callable[[Columns], Columns], inputs: Columns, chunks: i
         return dict(function(inputs))
     pieces = zip(*(column.chunk(chunks) for column in inputs.values()), strict=True)
     rows = [dict(zip(inputs, piece, strict=True)) for piece in pieces]
-    if torch.is_grad_enabled():
-        done = [checkpoint(function, row, use_reentrant=False, preserve_rng_state=False) for row in rows]
-    else:
-        done = [function(row) for row in rows]
+    done = [checkpoint(function, row, use_reentrant=False, preserve_rng_state=False) for row in rows]
     return {name: torch.cat([columns[name] for columns in done]) for name in done[0]}
 
 
 def own_share(objective: ObjectiveSettings, done: float) -> float:
-    """The template start: an image's share in its own maps after this share of the run, 0 (all shared) to 1.
-
-    While maps are shared only camera and light can explain how images differ, so both are learnt.
-    """
+    """The template start: an image's share in its own maps at this share of the run, 0 (all shared) to 1."""
     if done < objective.template_share:
-        return 0.0
+        return 0.0  # only camera and light can explain how images differ, so both are learnt
     if objective.release_share == 0:
         return 1.0
     return min((done - objective.template_share) / objective.release_share, 1.0)
 
 
-def share_codes(
-    codes: Mapping[str, Float[Tensor, "n _"]], names: Collection[str], own: float, ranks: Ranks = ALONE
-) -> dict[str, Float[Tensor, "n _"]]:
+def share_codes(codes: Codes, names: Collection[str], own: float, ranks: Ranks = ALONE) -> Codes:
     """The codes of the named factors moved to their mean over the batch; ``own`` = 1 leaves them."""
     shared = dict(codes)
     for name in names if own < 1 else ():

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, Int64
 from torch import Generator, Tensor, nn
 
+from derender.networks.encoders import Pixels
 from derender.training.distributed import Ranks
 from derender.training.run_folder import RunFolder
 from derender.training.watch import Finding, FiniteWatch
@@ -36,10 +37,7 @@ Losses = Callable[..., StepLosses]
 
 
 class Step(nn.Module):
-    """A model with the losses of its batches, as one module that a strategy may wrap.
-
-    Wrappers search the output for tensors; the function around the result hides it from them.
-    """
+    """A model with the losses of its batches, as one module that a strategy may wrap."""
 
     def __init__(self, model: nn.Module, losses: Losses):
         super().__init__()
@@ -47,17 +45,14 @@ class Step(nn.Module):
 
     def forward(self, *batch: Any) -> tuple[Tensor, Callable[[], StepLosses]]:
         result = self.losses(*batch)
-        return result.total, lambda: result
+        return result.total, lambda: result  # hidden from wrappers, which search the output for tensors
 
 
 class TrainingTask(ABC):
-    """What the loop needs to know of what it trains: a `LoopSettings`, and the methods below.
-
-    Held-out images are not judged by terms ``outside_loss``.
-    """
+    """What the loop needs to know of what it trains: a `LoopSettings`, and the methods below."""
 
     config: Any
-    outside_loss: Any = ()
+    outside_loss: Any = ()  # terms by which held-out images are not judged
     replayable: ClassVar[bool] = False
     """Whether a step draws on the device of its generator and reads nothing back: then it can be recorded."""
 
@@ -77,9 +72,7 @@ class TrainingTask(ABC):
         """
 
     @abstractmethod
-    def losses(
-        self, model: Any, run: RunFolder, images: UInt8[Tensor, "n 3 h w"], progress: PhaseProgress
-    ) -> Losses:
+    def losses(self, model: Any, run: RunFolder, images: Pixels, progress: PhaseProgress) -> Losses:
         """The losses of a batch, by which ``model`` learns; what they need is made of all images."""
 
     def watch(self, memory: dict[str, Any]) -> FiniteWatch:

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 
 from derender.data import Progress, as_float
 from derender.model import Derenderer
-from derender.networks.encoders import PIXEL_CHANNELS, UNetDecoder, UNetEncoder
+from derender.networks.encoders import PIXEL_CHANNELS, Images, Pixels, UNetDecoder, UNetEncoder
 from derender.objectives.reconstruction import masked_l1
 from derender.render import warp
 from derender.training.distillation import MEASURED_IMAGES, Student, StudentSettings
@@ -58,7 +57,7 @@ class PixelTargets:
 
 
 def distil_unets(
-    model: Derenderer, images: UInt8[Tensor, "n 3 h w"], settings: UNetSettings | None = None, *,
+    model: Derenderer, images: Pixels, settings: UNetSettings | None = None, *,
     seed: int = 0, progress: Progress | None = None,
 ) -> Student:  # fmt: skip
     """A copy of a trained model with U-Net encoders of geometry and albedo and a decoder that learnt from it.
@@ -106,7 +105,7 @@ def _encoders(model: Any) -> dict[str, UNetEncoder]:
 
 
 def _learn(
-    model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: UInt8[Tensor, "n 3 h w"],
+    model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: Pixels,
     settings: UNetSettings, generator: Generator, progress: Progress | None,
 ) -> None:  # fmt: skip
     joint, encoders = student.unet_decoder, _encoders(student)
@@ -150,7 +149,7 @@ def _learn(
 
 
 @torch.no_grad()
-def pixel_targets(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> PixelTargets:
+def pixel_targets(model: Derenderer, images: Images) -> PixelTargets:
     """A model's predictions for each pixel of images in 0..1."""
     codes = model.encode(images)
     scene = model.decode(codes)
@@ -166,7 +165,7 @@ def pixel_targets(model: Derenderer, images: Float[Tensor, "n 3 h w"]) -> PixelT
 
 
 def augmented(
-    images: Float[Tensor, "n 3 h w"], targets: PixelTargets, straight: int, generator: Generator
+    images: Images, targets: PixelTargets, straight: int, generator: Generator
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Images, maps and mask, all but the first ``straight`` zoomed, moved, mirrored and lit otherwise."""
     count, device = len(images), images.device
@@ -192,9 +191,7 @@ def augmented(
 
 
 @torch.no_grad()
-def _errors(
-    model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: UInt8[Tensor, "n 3 h w"]
-) -> dict[str, float]:
+def _errors(model: Derenderer, student: Derenderer, heads: nn.ModuleDict, images: Pixels) -> dict[str, float]:
     shown = as_float(images).to(model.device)
     targets = pixel_targets(model, shown)
     own = {name: heads[name](encoder.skips(shown)) for name, encoder in _encoders(student).items()}

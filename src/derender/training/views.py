@@ -45,12 +45,10 @@ def photographs(
     model: Derenderer, scene: Scene, images: Float[Tensor, "n 3 h w"], generator: Generator, count: int,
     turns: PerturbSettings = TURNS,
 ) -> list[Float[Tensor, "n 3 h w"]]:  # fmt: skip
-    """The images, then as often in light from any side, turned by ``turns``, by another camera; all in 0..1.
-
-    The images' own pixels lie on the surfaces; each is multiplied by the new shading over its own.
-    """
+    """The images, then as often in light from any side, turned by ``turns``, by another camera; in 0..1."""
     shown, fov = [images], model.fov_deg
     normals = normals_from_depth(scene.depth, fov)
+    # the images' own pixels lie on the surfaces; each is multiplied by the new shading over its own
     texture = unwarp(images, scene.depth, scene.camera, fov)
     texture = texture / lambert_shading(normals, scene.light).clamp(min=DARKEST)
 

@@ -54,7 +54,7 @@ class Sign:
     above: bool  # the sign is on when the measurement is above the limit (else below)
     fatal: bool
     text: str  # {value} is the measurement
-    advice: str
+    advice: str  # {slower} is what all advice to learn slower has in common
     grace_images: int = GRACE_IMAGES
     usual_images: int = 0  # how long a healthy run may show it
     invert: float | None = None  # below it reliefs are inverted, once in a run, which then continues
@@ -63,10 +63,7 @@ class Sign:
         return measured > self.limit if self.above else measured < self.limit
 
 
-_TABLE = table_beside(__file__, "signs.yaml")
-SIGNS = tuple(
-    Sign(name, **row | {"advice": row["advice"].format(slower=SLOWER)}) for name, row in _TABLE.items()
-)
+SIGNS = tuple(Sign(name, **row) for name, row in table_beside(__file__, "signs.yaml").items())
 MEASURES = tuple(dict.fromkeys(sign.measure for sign in SIGNS))
 
 
@@ -141,10 +138,8 @@ class Watcher(FiniteWatch):
                 return watcher
         except (TypeError, AttributeError):
             pass
-        raise ValueError(
-            "the checkpoint does not hold what the collapse detector remembers: resume with watch=false, "
-            "or train in another folder"
-        )
+        fix = "resume with watch=false, or train in another folder"
+        raise ValueError(f"the checkpoint does not hold what the collapse detector remembers: {fix}")
 
     def memory(self) -> dict[str, Any]:
         averages, on_since = dict(self.averages), dict(self.on_since)
@@ -200,7 +195,8 @@ class Watcher(FiniteWatch):
                 self.inversion = "due"
                 del self.averages[sign.measure], self.on_since[sign.name]
             else:
-                findings.append(Finding(sign.name, sign.text.format(value=value), sign.advice, sign.fatal))
+                text, advice = sign.text.format(value=value), sign.advice.format(slower=SLOWER)
+                findings.append(Finding(sign.name, text, advice, sign.fatal))
         return tuple(findings)
 
 
@@ -240,10 +236,8 @@ def measure(scene: Scene, ranges: SceneRanges) -> dict[str, Float[Tensor, ""]]:
     half, middle = (high - low) / 2, (high + low) / 2
     spread = depth.std(dim=(1, 2))
     steps = (depth.diff(dim=2).abs().mean(dim=(1, 2)) + depth.diff(dim=1).abs().mean(dim=(1, 2))) / 2
-    height, width = depth.shape[1:]
-    y = torch.linspace(-1, 1, height, device=depth.device)[:, None]
-    x = torch.linspace(-1, 1, width, device=depth.device)[None]
-    radius = (x.square() + y.square()).sqrt()
+    y, x = (torch.linspace(-1, 1, size, device=depth.device) for size in depth.shape[1:])
+    radius = (x.square() + y[:, None].square()).sqrt()
     ring, core = (radius > 0.7) & (radius < 1.0), radius < 0.4
     rim, centre = ((depth * part).sum(dim=(1, 2)) / part.sum() for part in (ring, core))
     rotation = scene.camera[:, :2].abs() / math.radians(ranges.rotation_deg)
