@@ -35,7 +35,6 @@ from derender.render import warp
 from derender.scene.crop import back, crop_images
 from derender.storage.places import optional, require_known
 
-OUTPUTS = ("logit", "probability")
 STEPS = {"logit": 2, "probability": 32}  # a logit is linear in the features: any number is exact
 NUMBERS_AT_ONCE = 4_000_000
 METHODS = ("grad-cam", "hires-cam", "pixels")
@@ -43,6 +42,8 @@ GREY = 0.5
 PIXEL_STEPS = 16
 UNCHANGED = 0.5
 CHANGES = ("random weights", "shuffled labels", "another image")
+Images = Float[Tensor, "n 3 h w"]  # in 0..1
+Targets = Sequence[int] | np.ndarray  # the label or class of each image
 
 
 def captum_attr() -> ModuleType:
@@ -51,38 +52,31 @@ def captum_attr() -> ModuleType:
 
 
 def integrated_gradients(
-    probe: Probe,
-    features: np.ndarray,
-    target: int,
-    *,
-    baseline: np.ndarray | None = None,
-    output: str = "logit",
+    probe: Probe, z: np.ndarray, target: int, *, baseline: np.ndarray | None = None, output: str = "logit"
 ) -> tuple[np.ndarray, np.ndarray]:
     """The contribution of each dimension to one answer, from the baseline to the image.
 
-    ``features`` are (N, D), ``target`` is the number of the label or class. ``baseline`` (D,) is zero by
+    ``z`` are (N, D) features, ``target`` is the number of the label or class. ``baseline`` (D,) is zero by
     default, as in the paper. ``output`` is "logit" or "probability". Returns (N, D) attributions, and (N,)
     completeness errors: their sum less the change of the answer.
     """
-    require_known("output", output, OUTPUTS)
+    require_known("output", output, tuple(STEPS))
     together = output == "probability" and probe.kind == "classes"  # only there the other answers matter
     rows = slice(None) if together else slice(target, target + 1)
     weight, bias = (torch.from_numpy(v[rows].astype(np.float64)) for v in (probe.weight, probe.bias))
 
-    def answer(z: Tensor) -> Tensor:
-        logits = z @ weight.T + bias
+    def answer(given: Tensor) -> Tensor:
+        logits = given @ weight.T + bias
         if output == "logit":
             return logits[:, 0]
         return logits.softmax(dim=1)[:, target] if together else logits[:, 0].sigmoid()
 
-    method, z = captum_attr().IntegratedGradients(answer), torch.from_numpy(features.astype(np.float64))
+    method, inputs = captum_attr().IntegratedGradients(answer), torch.from_numpy(z.astype(np.float64))
     if not len(z):
-        return np.zeros(features.shape), np.zeros(0)
-    start = z.new_zeros(1, z.shape[1]) if baseline is None else z.new_tensor(baseline[None])
-    result, error = method.attribute(
-        z, start, n_steps=STEPS[output], return_convergence_delta=True,
-        internal_batch_size=max(len(z), NUMBERS_AT_ONCE // z.shape[1]),
-    )  # fmt: skip
+        return np.zeros(z.shape), np.zeros(0)
+    start = inputs.new_tensor(np.zeros((1, z.shape[1])) if baseline is None else baseline[None])
+    how = {"n_steps": STEPS[output], "internal_batch_size": max(len(z), NUMBERS_AT_ONCE // z.shape[1])}
+    result, error = method.attribute(inputs, start, **how, return_convergence_delta=True)
     return result.detach().numpy(), error.detach().numpy()
 
 
@@ -95,12 +89,7 @@ def factor_shares(attributions: np.ndarray, probe: Probe) -> np.ndarray:
 
 
 def saliency(
-    method: str,
-    model: Any,
-    images: Float[Tensor, "n 3 h w"],
-    factor: str,
-    probe: Probe | None = None,
-    targets: Sequence[int] | np.ndarray = (),
+    method: str, model: Any, images: Images, factor: str, probe: Probe | None = None, targets: Targets = ()
 ) -> Float[Tensor, "n height width"]:
     """A map by one of ``METHODS``, none below 0: 4 x 4 for the two CAMs, the image's size for pixels.
 
@@ -159,15 +148,14 @@ def _at_features(
 
 
 def pixel_attribution(
-    model: Any, images: Float[Tensor, "n 3 h w"], factor: str, weight: Tensor | None
+    model: Any, images: Images, factor: str, weight: Tensor | None
 ) -> Float[Tensor, "n h w"]:
     """|IG| of the pixels from a grey image, summed over colours."""
     grey = torch.full_like(images[:1], GREY)
     with torch.enable_grad():
-        result = captum_attr().IntegratedGradients(partial(_answer, model, factor)).attribute(
-            images, grey, additional_forward_args=weight, n_steps=PIXEL_STEPS,
-            internal_batch_size=max(len(images), 64),
-        )  # fmt: skip
+        method = captum_attr().IntegratedGradients(partial(_answer, model, factor))
+        how = {"n_steps": PIXEL_STEPS, "internal_batch_size": max(len(images), 64)}
+        result = method.attribute(images, grey, additional_forward_args=weight, **how)
     return result.detach().abs().sum(dim=1).to(images)
 
 

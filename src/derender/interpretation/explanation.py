@@ -28,7 +28,6 @@ from derender.interpretation.attribution import Similarity, captum_attr, factor_
 from derender.interpretation.probe import Probe, fit_probe, question
 from derender.storage.places import require_known
 
-BASELINES = ("zero", "mean")
 BOOTSTRAP = 500
 LEARNED_SHARE, LEARNED_MOST = 0.4, 500
 
@@ -120,8 +119,7 @@ def explain(
         if name not in images.files:
             raise ValueError(f"{images.source} has no image {name!r}{suggestion(name, images.files)}")
     table = embed_image_set(net, images, batch_size=batch_size, progress=progress("embedding"))
-    names = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels))
-    left_out: list[str] = []
+    names, left_out = (labels,) if isinstance(labels, str) else tuple(dict.fromkeys(labels)), []
     if not names:
         names, left_out = chosen_labels(table, None, True, least=max(min_count, 1))
     task = question(table.labels, names, bins=bins, min_count=min_count, source=images.source)
@@ -131,10 +129,8 @@ def explain(
     for one in own:
         how = {"batch_size": batch_size, "progress": progress(f"untrained encoder {one}")}
         untrained.append(embed_images(untrained_twin(net, one), images.images, **how))
-    shares = explain_labels(
-        table.factors, task, split, untrained=untrained, seeds=own, head=head, output=output,
-        baseline=baseline, progress=progress("probing"),
-    )  # fmt: skip
+    how = {"head": head, "output": output, "baseline": baseline, "progress": progress("probing")}
+    shares = explain_labels(table.factors, task, split, untrained=untrained, seeds=own, **how)
     apart = alike = None
     if clusters is not None:
         made = clusterings(table.concatenate(), [clusters], seed=seed)[clusters]
@@ -178,7 +174,7 @@ def explain_labels(
     the paper's "linear", ``output`` "logit" or "probability"; ``baseline`` "zero" (the paper's) or the
     training rows' "mean". ``progress`` is called with (probes done, probes in all).
     """
-    require_known("baseline", baseline, BASELINES)
+    require_known("baseline", baseline, ("zero", "mean"))
     if len(split.train) != 1:
         raise ValueError(f"an explanation learns from one number of rows, got {len(split.train)}")
     ((count, train),) = split.train.items()
@@ -201,25 +197,22 @@ def explain_labels(
                 progress(sum(map(len, runs.values())), total)
     first, shuffled = (runs[name][0][0] for name in ("model", "shuffled labels"))
     shares = tuple(_row(name, [result for _, *result in own]) for name, own in runs.items() if own)
-    return tables.Explanation(
-        task.kind, task.names, first.factors, shares, first, shuffled, count, len(split.test), head, output,
-        baseline,
-    )  # fmt: skip
+    results = task.kind, task.names, first.factors, shares, first, shuffled
+    return tables.Explanation(*results, count, len(split.test), head, output, baseline)
 
 
 def _shares(
     probe: Probe, z: np.ndarray, targets: np.ndarray, start: np.ndarray | None, output: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per image (T, A, F) shares, NaN where not asked; and (2,) the largest completeness error and change."""
-    shares = np.full((*targets.shape, len(probe.sizes)), np.nan)
-    error, scale = np.zeros((2, 1))
+    shares, largest = np.full((*targets.shape, len(probe.sizes)), np.nan), np.zeros(2)
     for answer in range(targets.shape[1]):
         asked = targets[:, answer] >= (0 if probe.kind == "labels" else 1)
         result, delta = integrated_gradients(probe, z[asked], answer, baseline=start, output=output)
         shares[asked, answer] = factor_shares(result, probe)
-        error = np.append(error, np.abs(delta))
-        scale = np.append(scale, np.abs(result.sum(axis=1) - delta))
-    return shares, np.array([error.max(), scale.max()])
+        both = np.abs([delta, result.sum(axis=1) - delta])
+        largest = np.maximum(largest, both.max(axis=1, initial=0))
+    return shares, largest
 
 
 def scores(probe: Probe, z: np.ndarray, targets: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -58,25 +58,18 @@ def question(
         raise ValueError(f"{source} has no labels, and an explanation needs answers to explain: add a table")
     columns, known = {}, {}
     for name in names:
-        values = np.asarray(named(labels, name, f"label of {source}"))
+        values = named(labels, name, f"label of {source}")
         columns[name] = without_rare(in_bins(values, bins), min_count)
         known[name] = columns[name][~missing(columns[name])].tolist()
         if len(known[name]) < FEWEST_IMAGES:
-            raise ValueError(
-                f"label {name!r} of {source} is known for {len(known[name])} images, and an explanation "
-                f"needs {FEWEST_IMAGES} or more: add images or choose another label"
-            )
+            few = f"is known for {len(known[name])} images, and an explanation needs {FEWEST_IMAGES} or more"
+            raise ValueError(f"label {name!r} of {source} {few}: add images or choose another label")
         if len(set(known[name])) < 2:
-            others = [
-                other
-                for other, values in labels.items()
-                if other != name and len(set(np.asarray(values)[~missing(values)].tolist())) > 1
-            ]
-            raise ValueError(
-                f"every labelled image of {source} has {name} {known[name][0]}, so there is nothing to "
-                f"distinguish{suggestion(name, others)}; labels with two classes or more: "
-                f"{', '.join(others) or 'none'}"
-            )
+            rest = {other: own[~missing(own)].tolist() for other, own in labels.items() if other != name}
+            others = [other for other, answers in rest.items() if len(set(answers)) > 1]
+            why = f"has {name} {known[name][0]}, so there is nothing to distinguish{suggestion(name, others)}"
+            able = f"labels with two classes or more: {', '.join(others) or 'none'}"
+            raise ValueError(f"every labelled image of {source} {why}; {able}")
     task = task_of(columns)
     if task.kind == "classes":
         return task
@@ -108,9 +101,7 @@ def without_rare(values: np.ndarray, min_count: int) -> np.ndarray:
     rare = known & np.isin(values.astype(str), distinct[counts < min_count])
     if not rare.any():
         return values
-    kept = values.astype(object)
-    kept[rare | ~known] = None
-    return kept
+    return np.where(known & ~rare, values.astype(object), np.array(None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +122,8 @@ class Probe:
     def __post_init__(self) -> None:
         expected = (len(self.names), sum(self.sizes.values()))
         if self.weight.shape != expected or self.bias.shape != expected[:1]:
-            raise ValueError(
-                f"a probe of {expected[0]} answers and {expected[1]} features has weights {expected}, got "
-                f"{self.weight.shape} and bias {self.bias.shape}"
-            )
+            needed = f"a probe of {expected[0]} answers and {expected[1]} features has weights {expected}"
+            raise ValueError(f"{needed}, got {self.weight.shape} and bias {self.bias.shape}")
 
     @property
     def factors(self) -> tuple[str, ...]:
@@ -151,10 +140,8 @@ class Probe:
         for name, size in self.sizes.items():
             result = features[name].shape[1] if name in features else 0
             if result != size:
-                raise ValueError(
-                    f"the probe needs {size} numbers of factor {name!r}, the features have {result}: use the "
-                    "model that it was fitted on"
-                )
+                needs = f"the probe needs {size} numbers of factor {name!r}, the features have {result}"
+                raise ValueError(f"{needs}: use the model that it was fitted on")
         return np.concatenate([features[name] for name in self.sizes], axis=1)
 
     def logits(self, features: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -199,8 +186,7 @@ def load_probe(folder: str | Path) -> Probe:
         if facts.format > FORMAT:
             raise ValueError(f"format {facts.format} is newer than this version of derender")
         arrays = {name: value.numpy() for name, value in read_tensors(folder / WEIGHTS_FILE).items()}
-        sizes = dict(facts.sizes)
-        return Probe(facts.kind, facts.names, sizes, arrays["weight"], arrays["bias"], facts.head)
+        return Probe(facts.kind, facts.names, dict(facts.sizes), arrays["weight"], arrays["bias"], facts.head)
     except (KeyError, ValueError) as error:
         raise ValueError(f"the probe in {folder} cannot be read ({error}): fit it again") from error
 
@@ -225,11 +211,10 @@ def fit_probe(
     if head == "logistic":
         how = {"kind": task.kind, "penalties": PENALTIES, "folds": min(FOLDS, len(x)), "seed": seed}
         weight, bias, _ = logistic_weights(x, y, **how)
-        weight = weight.T
     else:
         how = {"kind": task.kind, "seeds": [seed], "settings": settings}
         _, result, start = fitted_heads(x, y, np.arange(len(x))[None], **how)
-        weight, bias = result[0].T.double().numpy(), start[0, 0].double().numpy()
+        weight, bias = result[0].double().numpy(), start[0, 0].double().numpy()
     if task.kind == "classes":
-        weight, bias = weight - weight.mean(axis=0), bias - bias.mean()
-    return Probe(task.kind, task.names, sizes, weight.astype(np.float32), bias.astype(np.float32), head)
+        weight, bias = weight - weight.mean(axis=1, keepdims=True), bias - bias.mean()
+    return Probe(task.kind, task.names, sizes, weight.T.astype(np.float32), bias.astype(np.float32), head)

@@ -80,14 +80,9 @@ def cluster_shares(
     generator, result = np.random.default_rng(seed), between(member)
     shuffled = [between(generator.permutation(member)) for _ in range(permutations)]
     distance = result / (sizes * (count - sizes) / count)[:, None]
-    return ClusterShares(
-        tuple(map(str, names)),
-        tuple(features),
-        sizes,
-        _over(distance, distance.sum(axis=1, keepdims=True)),
-        _over(result, total),
-        _over(np.mean(shuffled, axis=0), total),
-    )
+    share = _over(distance, distance.sum(axis=1, keepdims=True))
+    ratio, chance = _over(result, total), _over(np.mean(shuffled, axis=0), total)
+    return ClusterShares(tuple(map(str, names)), tuple(features), sizes, share, ratio, chance)
 
 
 def pair_parts(
@@ -106,14 +101,10 @@ def pair_parts(
     inner = np.array([v[first] @ v[second] for v in rows])
     lengths = np.array([np.linalg.norm(v[[first, second]], axis=1) for v in rows])  # (F, 2)
     own, whole = lengths.prod(axis=1), np.linalg.norm(lengths, axis=0).prod()
-    return PairParts(
-        tuple(features),
-        distance[:, 0],
-        _over(distance[:, 0], distance.sum()),
-        _over(inner, whole),
-        np.divide(inner, own, out=np.full(len(rows), np.nan), where=own > 0),
-        (apart(one, other) > distance).mean(axis=1),
-    )
+    shares = _over(distance[:, 0], distance.sum()), _over(inner, whole)
+    own_cosine = np.divide(inner, own, out=np.full(len(rows), np.nan), where=own > 0)
+    quantile = (apart(one, other) > distance).mean(axis=1)
+    return PairParts(tuple(features), distance[:, 0], *shares, own_cosine, quantile)
 
 
 def _over(part: np.ndarray, whole: np.ndarray | float) -> np.ndarray:
@@ -145,16 +136,11 @@ class ShareRow:
             "share": self.shares.mean(axis=0), "low": self.low, "high": self.high, "spread": spread,
             "drop": self.drop.mean(axis=0),
         }  # fmt: skip
-        answers = {
-            name: {
-                "auc": self.auc[:, answer].mean(),
-                "factors": {
-                    factor: {part: values[answer, place] for part, values in parts.items()}
-                    for place, factor in enumerate(factors)
-                },
-            }
-            for answer, name in enumerate(names)
-        }
+        answers = {}
+        for answer, name in enumerate(names):
+            own = {part: values[answer] for part, values in parts.items()}
+            shown = {factor: {part: own[part][at] for part in own} for at, factor in enumerate(factors)}
+            answers[name] = {"auc": self.auc[:, answer].mean(), "factors": shown}
         return {"control": self.control, "completeness_error": self.error, "answers": answers}
 
 
@@ -189,10 +175,9 @@ AUC = Column("AUC", note="area under the ROC curve on held-out images, chance 0.
 
 def share_table(result: Explanation) -> ScoreTable:
     """One row for each label or class, their mean first; the means of the controls last."""
-    columns: list[Column] = []
-    for factor in result.factors:
-        column = Column(factor, note="share of the sum of |integrated gradients|, 0 to 1")
-        columns += [column, interval_column(column, "images")]
+    note = "share of the sum of |integrated gradients|, 0 to 1"
+    shares = [Column(factor, note=note) for factor in result.factors]
+    columns = [column for share in shares for column in (share, interval_column(share, "images"))]
     model = result.rows[0]
 
     def cells(row: ShareRow, answer: int | None) -> list[Cell]:
@@ -250,15 +235,11 @@ def sanity_table(rows: Sequence[Similarity]) -> ScoreTable:
         Column("empty", None, 2, "share of comparisons left out because a map was empty"),
         Column("changes", None, note="whether new weights change the map"),
     )
-    result: dict[str, dict[str, Similarity]] = {}
-    for row in rows:
-        result.setdefault(f"{row.method}, {row.factor}", {})[row.changed] = row
-    lines = []
-    for name, by_change in result.items():
-        fresh, labels, other = (by_change[changed] for changed in CHANGES)
+    lines, by_change = [], ([row for row in rows if row.changed == changed] for changed in CHANGES)
+    for fresh, labels, other in zip(*by_change, strict=True):
         word = "-" if fresh.empty == 1 else "yes" if fresh.spearman < UNCHANGED else "no"
         cells = (fresh.spearman, fresh.ssim, labels.spearman, other.spearman, fresh.empty, word)
-        lines.append(Row(name, cells))
+        lines.append(Row(f"{fresh.method}, {fresh.factor}", cells))
     return ScoreTable("Do maps change with the learned weights? Similarity, -1 to 1", "map", columns, lines)
 
 
@@ -273,9 +254,8 @@ def cluster_share_table(result: ClusterShares) -> ScoreTable:
     share = "share of the squared distance to the mean of all other images, 0 to 1"
     ratio = Column("ratio", note="share of a factor's variance between cluster and rest; in brackets chance")
     columns = [column for factor in result.factors for column in (Column(factor, note=share), ratio)]
-    rows = []
-    columns_of = (result.names, result.sizes, result.share, result.ratio, result.chance)
-    for name, size, *parts in zip(*columns_of, strict=True):
+    rows, by_row = [], (result.names, result.sizes, result.share, result.ratio, result.chance)
+    for name, size, *parts in zip(*by_row, strict=True):
         cells: list[Cell] = [int(size)]
         for own, between, chance in zip(*parts, strict=True):
             cells += [float(own), f"{between:.3f} ({chance:.3f})"]
