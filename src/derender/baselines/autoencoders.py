@@ -258,9 +258,8 @@ class Residual(nn.Module):
     def __init__(self, width: int, *, normalised: bool):
         super().__init__()
         norm = [nn.BatchNorm2d(width)] if normalised else []
-        self.layers = nn.Sequential(
-            nn.ReLU(), nn.Conv2d(width, width, 3, padding=1), *norm, nn.ReLU(), nn.Conv2d(width, width, 1)
-        )
+        around, here = nn.Conv2d(width, width, 3, padding=1), nn.Conv2d(width, width, 1)
+        self.layers = nn.Sequential(nn.ReLU(), around, *norm, nn.ReLU(), here)
 
     def forward(self, grid: Grid) -> Grid:
         return grid + self.layers(grid)

@@ -77,9 +77,8 @@ def pca_features(
     source = (images if fit_on is None else fit_on).require(2, "PCA")
     limit = min(len(source), source.images[0].size)
     if not 1 <= components <= limit:
-        raise ValueError(
-            f"{components} components cannot be had from {len(source)} images: ask for 1 to {limit}"
-        )
+        given = f"{len(source)} images: ask for 1 to {limit}"
+        raise ValueError(f"{components} components cannot be had from {given}")
     pca = PCA(components, whiten=True, random_state=seed).fit(flat_pixels(source.images))
     facts = {"components": components, "whiten": True, "fitted_on": len(source), "seed": seed}
     return control_table(images, "pca", pca.transform(flat_pixels(images.images)), facts)

@@ -16,13 +16,14 @@ from derender.baselines import model as base
 from derender.storage.bounded import first_line
 from derender.storage.places import optional
 
+WEIGHTS = "facebook/dinov2-small"
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Dinov2Settings(base.BaselineSettings):
     """Which weights, and the side to which images are enlarged: a multiple of the patches' 14 pixels."""
 
-    weights: str = "facebook/dinov2-small"
+    weights: str = WEIGHTS
     enlarged: int = 224
 
 
@@ -56,31 +57,25 @@ class Dinov2(base.BaselineModel):
         ``source`` is an id in the Hugging Face cache, or a folder with config.json and model.safetensors.
         Missing weights, a pickle, or another kind of network are a ValueError.
         """
-        settings = Dinov2Settings(image_size=image_size or 64)
-        if source is not None:
-            settings = settings.model_copy(update={"weights": str(source)})
-        source, folder = settings.weights, Path(settings.weights)
-        if folder.suffix.lower() in base.PICKLES or (
-            folder.is_dir() and not (folder / base.WEIGHTS_FILE).is_file()
-        ):
-            raise ValueError(  # an index of shards could name files outside the folder (CVE-2026-75104)
-                f"{source} has no {base.WEIGHTS_FILE}: give a folder with config.json and the weights in "
-                "that one file. Weights in parts, and pickles, which can run code, are not opened"
-            )
+        source = WEIGHTS if source is None else str(source)
+        settings, folder = Dinov2Settings(image_size=image_size or 64, weights=source), Path(source)
+        # an index of shards could name files outside the folder (CVE-2026-75104)
+        in_parts = folder.is_dir() and not (folder / base.WEIGHTS_FILE).is_file()
+        if in_parts or folder.suffix.lower() in base.PICKLES:
+            fix = "give a folder with config.json and the weights in that one file"
+            why = "Weights in parts, and pickles, which can run code, are not opened"
+            raise ValueError(f"{source} has no {base.WEIGHTS_FILE}: {fix}. {why}")
         library = optional("transformers", "the baseline dinov2")
         try:
             tree, _ = library.PretrainedConfig.get_config_dict(source, local_files_only=True)
             if tree.get("model_type") != "dinov2":
                 raise ValueError(f"{source} is a {tree.get('model_type')}, expected a dinov2")
-            net, info = library.Dinov2Model.from_pretrained(
-                source, local_files_only=True, use_safetensors=True, output_loading_info=True
-            )
+            how = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
+            net, info = library.Dinov2Model.from_pretrained(source, **how)
         except OSError as error:
-            raise ValueError(
-                f"the weights {source} are not in the Hugging Face cache or cannot be read, and nothing is "
-                f"downloaded here ({first_line(error)}): run 'hf download {source}' once where there is a "
-                "network, or name their folder"
-            ) from error
+            why = "are not in the Hugging Face cache or cannot be read, and nothing is downloaded here"
+            fix = f"run 'hf download {source}' once where there is a network, or name their folder"
+            raise ValueError(f"the weights {source} {why} ({first_line(error)}): {fix}") from error
         if missing := sorted(info["missing_keys"]):
             raise ValueError(f"{source} is of another architecture: it has no {missing[0]!r}")
         return cls(settings, net).eval().requires_grad_(False)

@@ -11,13 +11,13 @@ small. Instead of e4e's discriminator of codes the first code is drawn towards t
 identity loss, which needs a face recogniser.
 """
 
+from collections.abc import Callable
 from itertools import pairwise
 from math import log2
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import UInt8
 from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, mse_loss
@@ -25,11 +25,8 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate, leaky_relu, ms
 from derender.baselines.generator import Codes, EqualLinear, Generator, GeneratorSettings, Side
 from derender.baselines.model import BaselineConfig, BaselineSettings, Features, Images, LoopModel, LossInputs
 from derender.baselines.stylegan2 import CENTRE_LATENTS, Stylegan
-from derender.objectives.perceptual import PerceptualFeatures
 from derender.settings import Settings
 from derender.training.batches import random_stream
-from derender.training.derender_task import self_features_of
-from derender.training.task import PhaseProgress
 
 FIRST_MIDDLE, FIRST_FINE = 3, 7  # numbers of the codes
 
@@ -118,6 +115,7 @@ class E4eEncoder(nn.Module):
         widths = (width, width, 2 * width, 4 * width, 8 * width)
         self.stem = nn.Conv2d(3, width, 3, padding=1, bias=False)
         self.stem_norm, self.stem_active = nn.BatchNorm2d(width), nn.PReLU(width)
+        self.doubled = nn.UpsamplingBilinear2d(scale_factor=2)
         self.stages = nn.ModuleList()
         for (before, after), count in zip(pairwise(widths), settings.units, strict=True):
             rest = (Unit(after, after, 1, settings.reduction) for _ in range(count - 1))
@@ -133,17 +131,13 @@ class E4eEncoder(nn.Module):
         at_4 = quarter(half(self.stem_active(self.stem_norm(self.stem(images)))))
         at_8 = eighth(at_4)
         coarse = sixteenth(at_8)
-        middle = _as_large(coarse, at_8) + self.to_middle(at_8)
-        fine = _as_large(middle, at_4) + self.to_fine(at_4)
+        middle = self.doubled(coarse) + self.to_middle(at_8)
+        fine = self.doubled(middle) + self.to_fine(at_4)
         sources = [coarse] * FIRST_MIDDLE + [middle] * (FIRST_FINE - FIRST_MIDDLE) + [fine] * len(self.heads)
         free = zip(self.heads[: released + 1], sources, strict=False)
         first, *added = (head(source) for head, source in free)
         same = len(self.heads) - 1 - len(added)
         return torch.stack([first, *(first + change for change in added), *[first] * same], dim=1)
-
-
-def _as_large(maps: Tensor, like: Tensor) -> Tensor:
-    return interpolate(maps, like.shape[-2:], mode="bilinear", align_corners=True)
 
 
 class E4e(LoopModel):
@@ -186,13 +180,9 @@ class E4e(LoopModel):
         return model
 
     @staticmethod
-    def prepare(
-        config: E4eConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress
-    ) -> PerceptualFeatures | None:
+    def prepare(config: E4eConfig, device: torch.device, perceptual: Callable[[], Any]) -> Any:
         """Features learnt from the images; None if they have no weight."""
-        if config.objective.perceptual_weight == 0:
-            return None
-        return self_features_of(config, file, images, progress)
+        return perceptual() if config.objective.perceptual_weight else None
 
     def invert(self, images: Images) -> Codes:
         """W+ of images in 0..1, which are enlarged to the encoder's size where they are smaller."""

@@ -216,26 +216,15 @@ def style_layers(settings: GeneratorSettings) -> tuple[StyleLayer, ...]:
     return tuple(StyleLayer(*row, settings.channels(row[-1])) for row in rows)
 
 
-class Mapping(nn.Module):
-    """z to w: every z divided by its root mean square, then equalised layers with a small rate."""
-
-    def __init__(self, settings: GeneratorSettings):
-        super().__init__()
-        size, rate, count = settings.style_size, settings.mapping_rate, settings.mapping_layers
-        self.layers = nn.Sequential(*(EqualLinear(size, size, rate=rate, active=True) for _ in range(count)))
-
-    def forward(self, z: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-        return self.layers(z * (z.square().mean(dim=1, keepdim=True) + TINY).rsqrt())
-
-
 class Generator(nn.Module):
     """Mapping and synthesis. ``layers`` lists what each style steers."""
 
     def __init__(self, settings: GeneratorSettings):
         super().__init__()
         self.settings, self.layers = settings, style_layers(settings)
-        channels, size = settings.channels, settings.style_size
-        self.mapping = Mapping(settings)
+        channels, size, rate = settings.channels, settings.style_size, settings.mapping_rate
+        steps = (EqualLinear(size, size, rate=rate, active=True) for _ in range(settings.mapping_layers))
+        self.mapping = nn.ModuleDict({"layers": nn.Sequential(*steps)})  # the name in saved weights
         self.constant = nn.Parameter(torch.randn(1, channels(4), 4, 4))
         convs = [StyledConv(channels(4), channels(4), size)]
         for half, whole in pairwise(settings.resolutions):
@@ -261,9 +250,9 @@ class Generator(nn.Module):
         return tuple(torch.randn(size, generator=generator).to(self.constant) for size in sizes)
 
     def random_w(self, count: int, generator: RandomGenerator) -> Float[Tensor, "n d"]:
-        """w of standard normal z."""
-        z = torch.randn(count, self.settings.style_size, generator=generator)
-        return self.mapping(z.to(self.constant))
+        """w of standard normal z, each of which is divided by its root mean square."""
+        z = torch.randn(count, self.settings.style_size, generator=generator).to(self.constant)
+        return self.mapping["layers"](z * (z.square().mean(dim=1, keepdim=True) + TINY).rsqrt())
 
     def w_plus(self, w: Float[Tensor, "n d"] | Codes) -> Codes:
         """One w for all layers, or W+ as it is."""

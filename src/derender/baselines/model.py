@@ -10,6 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,12 +23,12 @@ from derender.data import ImageSet, check_images, split_indices
 from derender.settings import Settings
 from derender.storage import folder as saved
 from derender.storage.atomic import new_folder
-from derender.storage.folder import FORMAT, naming_damage, read_weights, saved_config
 from derender.storage.places import CONFIG_FILE, WEIGHTS_FILE, require_known
 from derender.storage.tensors import write_tensors
 from derender.training import config as configs
 from derender.training import run_folder
 from derender.training import task as loop
+from derender.training.derender_task import self_features_of
 from derender.training.loop import train_task
 
 PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
@@ -98,7 +99,8 @@ class BaselineModel(nn.Module, ABC):
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write settings and weights to ``folder``; complete or not at all."""
-        config = {"format": FORMAT, "baseline": self.name, "settings": self.settings.model_dump(mode="json")}
+        settings = self.settings.model_dump(mode="json")
+        config = {"format": saved.FORMAT, "baseline": self.name, "settings": settings}
         with new_folder(folder, overwrite=overwrite) as temporary:
             write_tensors(self.state_dict(), temporary / WEIGHTS_FILE)
             (temporary / CONFIG_FILE).write_text(json.dumps(config, indent=1))
@@ -112,19 +114,19 @@ def load_baseline(source: str | Path, name: str | None = None) -> BaselineModel:
     a ValueError: it is a pickle, damaged, another baseline, or none.
     """
     folder = _folder_of(Path(source))
-    config = saved_config(folder)
+    config = saved.saved_config(folder)
     if "baseline" not in config:
         raise ValueError(f"{folder} holds a derender model and no baseline: leave the baseline's name out")
     stored = str(config["baseline"])
     if name not in (None, stored):
         raise ValueError(f"{folder} holds the baseline {stored!r}, asked for {name}")
     kind = network_type(stored)
-    with naming_damage(folder):
+    with saved.naming_damage(folder):
         settings = kind.settings_type.model_validate(config["settings"])
     with torch.device("meta"):
         kind(settings)  # a package that is missing is an error of its own
-    with naming_damage(folder):
-        model: BaselineModel = read_weights(folder, lambda: kind(settings))
+    with saved.naming_damage(folder):
+        model: BaselineModel = saved.read_weights(folder, lambda: kind(settings))
     return model.eval().requires_grad_(False)
 
 
@@ -134,14 +136,11 @@ def _folder_of(source: Path) -> Path:
             return candidate
     for file in (source, *(sorted(source.iterdir()) if source.is_dir() else ())):
         if file.suffix.lower() in PICKLES:
-            raise ValueError(
-                f"{file} is a pickle, which can run code when it is read, and is not opened: give a run "
-                f"folder with {WEIGHTS_FILE} in it"
-            )
-    raise FileNotFoundError(
-        f"no baseline at {source} (expected {CONFIG_FILE} and {WEIGHTS_FILE} there or in 'model'): "
-        "give a run folder made by 'derender train --model NAME'"
-    )
+            refused = "is a pickle, which can run code when it is read, and is not opened"
+            raise ValueError(f"{file} {refused}: give a run folder with {WEIGHTS_FILE} in it")
+    missing = f"expected {CONFIG_FILE} and {WEIGHTS_FILE} there or in 'model'"
+    fix = "give a run folder made by 'derender train --model NAME'"
+    raise FileNotFoundError(f"no baseline at {source} ({missing}): {fix}")
 
 
 @dataclass(frozen=True)
@@ -170,10 +169,8 @@ class LoopModel(BaselineModel):
         return cls(config.model)
 
     @staticmethod
-    def prepare(
-        config: Any, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: loop.PhaseProgress
-    ) -> Any:
-        """What the losses need besides the network, from the training images; ``file`` keeps it."""
+    def prepare(config: Any, device: torch.device, perceptual: Callable[[], Any]) -> Any:
+        """What the losses need besides the network; ``perceptual`` gives features learnt from the images."""
         return None
 
     @abstractmethod
@@ -187,7 +184,8 @@ class LoopModel(BaselineModel):
     @classmethod
     def train_into(cls, config: Any, images: ImageSet, out: str | Path, **how: Any) -> loop.TrainResult:
         """Train in the common loop; see `train_baseline`."""
-        return train_task(BaselineTask(config), images, out, **how)
+        task = BaselineTask(config, (*OUTSIDE_LOSS, *cls.not_judged))
+        return train_task(task, images, out, **how)
 
 
 @dataclass(frozen=True)
@@ -195,11 +193,7 @@ class BaselineTask(loop.TrainingTask):
     """Train a baseline as its configuration says."""
 
     config: Any
-
-    @property
-    def outside_loss(self) -> tuple[str, ...]:
-        """Names of numbers by which held-out images are not judged."""
-        return (*OUTSIDE_LOSS, *network_type(self.config.baseline).not_judged)
+    outside_loss: tuple[str, ...]
 
     def build(self) -> LoopModel:
         """The untrained network; torch's global generator is left as it was."""
@@ -211,7 +205,8 @@ class BaselineTask(loop.TrainingTask):
         self, model: LoopModel, run: run_folder.RunFolder, images: UInt8[Tensor, "n 3 h w"],
         progress: loop.PhaseProgress,
     ) -> loop.Losses:  # fmt: skip
-        aid = model.prepare(self.config, images, run.perceptual, progress)
+        learnt = partial(self_features_of, self.config, run.perceptual, images, progress)
+        aid = model.prepare(self.config, images.device, learnt)
 
         def step(batch: Tensor, generator: Generator, precision: loop.Precision, *_: Any) -> loop.StepLosses:
             terms = model.losses(batch, LossInputs(self.config, generator, precision, aid))
@@ -229,9 +224,8 @@ class ShortRun:
         progress: Callable[[loop.Progress], None] | None = None, accelerator: str = "cpu",
     ):  # fmt: skip
         if resume:
-            raise ValueError(
-                f"{config.baseline} trains in minutes and is not resumed: train it again into another folder"
-            )
+            why = "trains in minutes and is not resumed"
+            raise ValueError(f"{config.baseline} {why}: train it again into another folder")
         self.config, self.split = config, split_indices(images.files, config.split, seed=config.seed)
         data = run_folder.describe_data(images, self.split)
         self.folder = run_folder.start_run(Path(out), config, data, accelerator)

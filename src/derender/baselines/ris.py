@@ -44,6 +44,7 @@ FACE_PARTS = {
 }
 """CelebAMask-HQ's classes as eight parts; other classes keep their names."""
 BATCH = 16
+Parts = Float[Tensor, "n p h w"]  # how much of each place every part has, 0..1
 
 
 class RisConfig(Settings):
@@ -123,10 +124,8 @@ class Ris(BaselineModel):
     ) -> TrainResult:  # fmt: skip
         """Build a catalogue into a new run folder; see `train_baseline`. No resume."""
         e4e = E4e.open(config.e4e).to(accelerator)
-        if e4e.image_size != config.image_size:
-            raise ValueError(
-                f"{config.e4e} takes images of {e4e.image_size} pixels: set image_size={e4e.image_size}"
-            )
+        if (size := e4e.image_size) != config.image_size:
+            raise ValueError(f"{config.e4e} takes images of {size} pixels: set image_size={size}")
         inputs, parts, names = masked_rows(images, config)
         run = ShortRun(config, images, out, resume=resume, accelerator=accelerator, **how)
         inputs, parts = inputs.to(accelerator), parts.to(accelerator)
@@ -139,9 +138,7 @@ class Ris(BaselineModel):
         return run.finish(model, len(inputs), channels)
 
 
-def masked_rows(
-    images: ImageSet, config: RisConfig
-) -> tuple[Images, Float[Tensor, "n p h w"], tuple[str, ...]]:
+def masked_rows(images: ImageSet, config: RisConfig) -> tuple[Images, Parts, tuple[str, ...]]:
     """The training part's images, a map of 0 and 1 for every part that occurs, and the parts' names."""
     masked = read_masks(images.source, config.image_size, masks=config.masks)
     row_of = {file: row for row, file in enumerate(masked.images.files)}
@@ -157,7 +154,7 @@ def masked_rows(
 
 
 def build_catalogue(
-    e4e: E4e, images: Images, parts: Float[Tensor, "n p h w"], names: tuple[str, ...], config: RisConfig, *,
+    e4e: E4e, images: Images, parts: Parts, names: tuple[str, ...], config: RisConfig, *,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Ris:  # fmt: skip
     """Cluster, name and score: a model ready to embed.
@@ -178,9 +175,8 @@ def build_catalogue(
             done += len(batch)
             progress(done, total)
 
-    sizes = [layer.resolution for layer in net.layers]  # the last layer of that side, or of the next smaller
-    side = max(size for size in sizes if size <= max(config.cluster_side, min(sizes)))
-    layer = len(sizes) - 1 - sizes[::-1].index(side)
+    sides = [layer.resolution for layer in net.layers]  # they grow from 4
+    layer = max(number for number, side in enumerate(sides) if side <= config.cluster_side)
     random = random_stream(config.seed, "perturb", 1)
     w, places = net.random_w(config.samples, random), []
     for seen in activations(w, net.w_plus):
@@ -190,8 +186,8 @@ def build_catalogue(
     centres = spherical_kmeans(torch.cat(places), config.clusters, random)
 
     clusters = [nearest_cluster(seen[layer], centres) for seen in activations(images, e4e.invert)]
-    at_side = adaptive_avg_pool2d(parts, side)
-    cluster_part = name_clusters(torch.cat(clusters), config.clusters, at_side)
+    shares = adaptive_avg_pool2d(parts, sides[layer])
+    cluster_part = name_clusters(torch.cat(clusters), config.clusters, shares)
 
     energies = []
     for seen in activations(w, net.w_plus):
@@ -205,8 +201,7 @@ def build_catalogue(
     own = {"parts": names, "clusters": config.clusters, "cluster_layer": layer}
     model = Ris(RisSettings(**e4e.settings.model_dump(), **own)).to(images.device)
     model.e4e.load_state_dict(e4e.state_dict())
-    for name, value in (("centres", centres), ("cluster_part", cluster_part), ("matrix", matrix)):
-        model.get_buffer(name).copy_(value)
+    model.load_state_dict({"centres": centres, "cluster_part": cluster_part, "matrix": matrix}, strict=False)
     return model.eval().requires_grad_(False)
 
 
@@ -219,9 +214,8 @@ def spherical_kmeans(
     is farthest from its own centre. Ends when no row changes its cluster, or after 50 rounds.
     """
     if len(vectors) < clusters:
-        raise ValueError(
-            f"{clusters} clusters need at least as many places, got {len(vectors)}: give more images"
-        )
+        got = f"got {len(vectors)}: give more images"
+        raise ValueError(f"{clusters} clusters need at least as many places, {got}")
     rows = normalize(vectors, dim=1)
     centres = rows[torch.randint(len(rows), (1,), generator=generator).to(rows.device)]
     while len(centres) < clusters:
@@ -246,9 +240,7 @@ def nearest_cluster(activation: Maps, centres: Float[Tensor, "k c"]) -> Int64[Te
     return torch.einsum("nchw,kc->nkhw", activation.square(), centres).argmax(dim=1)
 
 
-def name_clusters(
-    clusters: Int64[Tensor, "n h w"], count: int, parts: Float[Tensor, "n p h w"]
-) -> Int64[Tensor, " k"]:
+def name_clusters(clusters: Int64[Tensor, "n h w"], count: int, parts: Parts) -> Int64[Tensor, " k"]:
     """The part of each of ``count`` clusters, from ``parts``, their shares of every place.
 
     The part has the largest share * log(share / the part's share of everything), so that small parts are

@@ -11,11 +11,10 @@ about the grey axis of RGB.
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Generator, Tensor, nn
 from torch.nn.functional import affine_grid, conv2d, grid_sample, normalize, pad
@@ -29,7 +28,6 @@ from derender.scene.perturb import PerturbSettings
 from derender.settings import Settings
 from derender.training.batches import random_stream
 from derender.training.config import LoopSettings, OptimiserSettings
-from derender.training.task import PhaseProgress
 from derender.training.views import renderings
 
 Views = Callable[[Images, Generator], Images]
@@ -94,12 +92,10 @@ def jitter(images: Images, settings: AugmentSettings, generator: Generator) -> I
 def rotate_hue(images: Images, angle_rad: Float[Tensor, " n"]) -> Images:
     """Colours rotated about the grey axis of RGB; greys stay."""
     cosine, sine = angle_rad.cos(), angle_rad.sin()
-    same = cosine + (1 - cosine) / 3
-    ahead = (1 - cosine) / 3 - sine / math.sqrt(3)
-    behind = (1 - cosine) / 3 + sine / math.sqrt(3)
-    rows = [(same, ahead, behind), (behind, same, ahead), (ahead, behind, same)]
-    rotation = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-    return torch.einsum("nij,njhw->nihw", rotation, images)
+    grey, third = (1 - cosine) / 3, sine / math.sqrt(3)
+    same, ahead, behind = cosine + grey, grey - third, grey + third
+    rows = torch.stack([same, ahead, behind, behind, same, ahead, ahead, behind, same], dim=1)
+    return torch.einsum("nij,njhw->nihw", rows.view(-1, 3, 3), images)
 
 
 def grey(images: Images) -> Images:
@@ -180,10 +176,8 @@ class Simclr(LoopModel):
         return model
 
     @staticmethod
-    def prepare(
-        config: SimclrConfig, images: UInt8[Tensor, "n 3 h w"], file: Path, progress: PhaseProgress
-    ) -> Views:
-        return views_of(config, images.device)
+    def prepare(config: SimclrConfig, device: torch.device, perceptual: Callable) -> Views:
+        return views_of(config, device)
 
     def describe(self, images: Images) -> Features:
         code = self.encoder(images)
@@ -208,15 +202,13 @@ class Simclr(LoopModel):
 
 def views_of(config: SimclrConfig, device: torch.device) -> Views:
     """The function that gives one random view of every image; a model of another size is an error."""
-    objective, size = config.objective, config.model.image_size
+    objective = config.objective
     if objective.physics is None:
         return lambda images, generator: augment(images, objective.augment, generator)
     renderer = load(objective.physics, device=device)
-    if renderer.image_size != size:
-        raise ValueError(
-            f"{objective.physics} takes images of {renderer.image_size} pixels, this run of {size}: "
-            f"set image_size={renderer.image_size}"
-        )
+    if (size := renderer.image_size) != config.model.image_size:
+        other = f"this run of {config.model.image_size}: set image_size={size}"
+        raise ValueError(f"{objective.physics} takes images of {size} pixels, {other}")
     return lambda images, generator: physical_view(renderer, images, objective.perturb, generator)
 
 

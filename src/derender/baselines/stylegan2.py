@@ -166,9 +166,8 @@ class Stylegan(LoopModel):
                 "discriminator": softplus(judge(fake.detach())).float().mean()
                 + softplus(-judge(real)).float().mean(),
             }
-        r1_weight = objective.r1_weight
-        if r1_weight is None:
-            r1_weight = R1_PER_PIXEL * real.shape[-1] ** 2 / n
+        usual = R1_PER_PIXEL * real.shape[-1] ** 2 / n
+        r1_weight = usual if objective.r1_weight is None else objective.r1_weight
         if r1_weight and step % objective.r1_every == 0:
             terms["r1"] = r1_weight * objective.r1_every * r1_penalty(judge, real)
         if objective.path_weight and step % objective.path_every == 0:
@@ -186,9 +185,8 @@ def mixed_w(net: gan.Generator, count: int, mixing: float, generator: RandomGene
     codes = net.settings.codes
     place = torch.randint(1, codes, (count,), generator=generator)
     mixed = torch.rand(count, generator=generator) < mixing
-    place = torch.where(mixed, place, codes).to(first.device)
-    later = torch.arange(codes, device=first.device) >= place[:, None]
-    return torch.where(later[:, :, None], second, first)
+    later = torch.arange(codes) >= torch.where(mixed, place, codes)[:, None]
+    return torch.where(later[:, :, None].to(first.device), second, first)
 
 
 def r1_penalty(discriminator: nn.Module, real: Images) -> Float[Tensor, ""]:
@@ -200,9 +198,7 @@ def r1_penalty(discriminator: nn.Module, real: Images) -> Float[Tensor, ""]:
 
 def path_lengths(net: gan.Generator, w_plus: gan.Codes, generator: RandomGenerator) -> Float[Tensor, " n"]:
     """How far an image moves, in a random direction, for a unit step of W+: |J^T y| over the codes' mean."""
-    if not w_plus.requires_grad:
-        w_plus = w_plus.requires_grad_(True)
-    fake = net(w_plus, net.random_noise(len(w_plus), generator))
+    fake = net(w_plus.requires_grad_(), net.random_noise(len(w_plus), generator))
     direction = torch.randn(fake.shape, generator=generator).to(fake) / sqrt(fake[0, 0].numel())
     (gradient,) = torch.autograd.grad((fake * direction).sum(), w_plus, create_graph=True)
     return gradient.square().sum(dim=2).mean(dim=1).sqrt()

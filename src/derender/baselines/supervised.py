@@ -23,16 +23,18 @@ from derender.settings import Names, Settings
 from derender.storage.places import optional
 from derender.training.task import TrainResult
 
+Classes = dict[str, tuple[str, ...]]
+"""Class names of every label column."""
 MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)
 """Views of labelled images: a little crop, flip and jitter."""
 
 
 class Resnet18Settings(BaselineSettings):
-    """The classes that the network distinguishes: the class names of every label column."""
+    """The classes that the network distinguishes."""
 
     image_size: int = Field(default=64, ge=32)
     width: int = Field(default=64, ge=1)  # of the first stage; each of the three others doubles it
-    classes: dict[str, tuple[str, ...]]
+    classes: Classes
 
 
 class SupervisedConfig(Settings):
@@ -102,8 +104,7 @@ class Resnet18(BaselineModel):
         for _ in range(config.epochs):
             for chosen in torch.randperm(len(rows), generator=generator)[:each].to(accelerator).split(batch):
                 parts = model.label_logits(augment(inputs[chosen], config.augment, generator))
-                answers = zip(parts, wanted[chosen].unbind(1), strict=True)
-                loss = torch.stack([cross_entropy(part, right) for part, right in answers]).mean()
+                loss = torch.stack([*map(cross_entropy, parts, wanted[chosen].unbind(1))]).mean()
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()
@@ -119,9 +120,7 @@ class Resnet18(BaselineModel):
         return run.finish(model, seen, scores)
 
 
-def fresh_resnet18(
-    image_size: int, seed: int, width: int = 64, classes: dict[str, tuple[str, ...]] | None = None
-) -> Resnet18:
+def fresh_resnet18(image_size: int, seed: int, width: int = 64, classes: Classes | None = None) -> Resnet18:
     """A ResNet-18 with fresh weights; torch's global generator is left as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -141,16 +140,14 @@ def labelled_rows(images: ImageSet, config: SupervisedConfig) -> np.ndarray:
 def drawn_labelled(rows: np.ndarray, count: int, seed: int, names: str) -> np.ndarray:
     """So many of the training part's rows that have the labels ``names``; fewer are an error."""
     if len(rows) < count:
-        raise ValueError(
-            f"{count:,} labelled images were requested, the training part has {len(rows):,} with {names}: "
-            f"set labelled={len(rows)} or fewer"
-        )
+        fewer = f"the training part has {len(rows):,} with {names}: set labelled={len(rows)} or fewer"
+        raise ValueError(f"{count:,} labelled images were requested, {fewer}")
     return np.random.default_rng(seed).permutation(rows)[:count]
 
 
 def encode_labels(
     images: ImageSet, labels: tuple[str, ...], rows: np.ndarray
-) -> tuple[dict[str, tuple[str, ...]], Int64[Tensor, "n labels"]]:
+) -> tuple[Classes, Int64[Tensor, "n labels"]]:
     """Class names of every label among these rows, in order, and each row's class numbers."""
     names, columns = {}, []
     for label in labels:
