@@ -69,7 +69,7 @@ def whiten(
     made = make_features(work.model, work.pixels, features, seed=seed, progress=work.progress)
     assert made.whitening is not None
     ratios = {name: made.whitening.get_buffer(f"{name}_ratios").tolist() for name in made.whitening.names}
-    return work.saved(made, {"between_over_within": ratios}, same_errors=True)
+    return work.saved(made, {"between_over_within": ratios}, same_weights=True)
 
 
 def refine(
@@ -92,8 +92,7 @@ def refine(
     training, held_out = work.pixels[split.train], work.pixels[split.validation]
     refined = distil(work.model, training, held_out, config, seed=seed, progress=work.progress)
     scores = {"held_out": len(held_out), "errors": refined.errors, "gaps": refined.gaps}
-    made = work.saved(refined.model, scores, split=work.part == "train", held_out=held_out)
-    return replace(made, images=len(split.train))
+    return replace(work.saved(refined.model, scores, held_out), images=len(split.train))
 
 
 def unet(
@@ -110,7 +109,7 @@ def unet(
     config = copy_settings("unet", settings)
     work = _Copying(model, images, Path(out), 2, **how)
     made = distil_unets(work.model, work.pixels, config, seed=seed, progress=work.progress)
-    return work.saved(made.model, {"errors": made.errors}, split=work.part == "train")
+    return work.saved(made.model, {"errors": made.errors})
 
 
 class _Copying:
@@ -125,28 +124,25 @@ class _Copying:
         self.out, self.part, self.overwrite, self.progress = out, part, overwrite, progress
         self.model = as_model(model, device=device)
         self.source = self.model.source if isinstance(model, Derenderer) else model
-        self.images = as_images(
-            images, self.model.image_size, part=part, model=self.source, at_least=at_least, **reading
-        )
+        reading |= {"part": part, "model": self.source, "at_least": at_least}
+        self.images = as_images(images, self.model.image_size, **reading)
         self.pixels = torch.from_numpy(self.images.images)
         if on_images is not None:
             on_images(self.images)
 
     def saved(
-        self, made: Derenderer, scores: dict[str, Any], *, split: bool = True, held_out: Tensor | None = None,
-        same_errors: bool = False,
+        self, made: Derenderer, scores: dict[str, Any], held_out: Tensor | None = None, *,
+        same_weights: bool = False,
     ) -> ModelCopy:  # fmt: skip
-        """Save the copy with the errors of held-out images, those of the original where they are the
-        ``same_errors``, and with ``split`` that of the original: other images were not seen. Complete or not
-        at all.
+        """Save the copy, with the original's split unless other images were seen, and with the errors of
+        ``held_out`` images, of the ``same_weights`` those of the original. Complete or not at all.
         """
         with new_folder(self.out, overwrite=self.overwrite) as folder:
             made.write(folder)
-            if split and self.source is not None:
-                copy_split(folder, self.source)
             if held_out is not None:
                 store_errors(folder, held_out)
-            kept = read_errors(model_folder(self.source)) if same_errors and self.source is not None else None
-            if kept is not None:
-                write_errors(folder, kept)
+            if self.source is not None and (same_weights or self.part == "train"):
+                copy_split(folder, self.source)
+                if same_weights and (kept := read_errors(model_folder(self.source))) is not None:
+                    write_errors(folder, kept)
         return ModelCopy(self.out, made, len(self.images), scores)

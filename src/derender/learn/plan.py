@@ -162,9 +162,8 @@ def _check(plan: Plan) -> None:
             raise ValueError(f"{needs} a table (identity, emotion, ...) or a label, not both")
         if where is None:
             if trained or part:
-                raise ValueError(
-                    f"{needs} trained_on: the training set of {', '.join(trained) or 'its part'}"
-                )
+                whose = ", ".join(trained) or "its part"
+                raise ValueError(f"{needs} trained_on: the training set of {whose}")
             continue
         learnt = named(plan.train, where, "training set")
         same = all(getattr(scored, key) == getattr(learnt, key) for key in ImageSource.model_fields)

@@ -56,15 +56,15 @@ def run_settings(
                 raise ValueError(f"{config} is for {other}, not for {value}: leave out {name}")
         model, preset = trains, preset if base is None else str(base)
         changes = [*as_overrides(stored), *changes]
-    model = model or "derender"
-    chosen = any(one is not None for one in (preset, loocc, start_from, renderer)) or bool(changes)
-    if resume and not chosen and out is not None and (Path(out) / "config.yaml").is_file():
-        return stored_config(Path(out), model)
+    model, own = model or "derender", None
+    if resume and out is not None and (Path(out) / "config.yaml").is_file():
+        own = stored_config(Path(out), model)
+        if not changes and (preset, loocc, start_from, renderer) == (None, None, None, None):
+            return own
     if model == "derender":
-        if preset is None and resume and out is not None and (Path(out) / "config.yaml").is_file():
-            preset = stored_config(Path(out), model).preset
         if preset is None:
-            preset = "faces" if start_from or device_named(device) == "cuda" else "small"
+            usual = "faces" if start_from or device_named(device) == "cuda" else "small"
+            preset = str(getattr(own, "preset", usual))
         explicit = {"objective__loocc": loocc, "model__renderer": renderer, "start_from": start_from}
         return resolve(preset, changes, **explicit)
     for name, value in (("preset", preset), ("loocc", loocc), ("renderer", renderer)):
@@ -111,7 +111,6 @@ def train(
         images = as_images(images, image_size_of(config), dataset=dataset, limit=limit, progress=reading)
     if on_images is not None:
         on_images(images)
-    ours = isinstance(config, TrainConfig)
 
     def sheet(*given: Any) -> Any:
         from derender.report.run import sample_sheet  # its import would delay the start by seconds
@@ -119,7 +118,8 @@ def train(
         return sample_sheet(*given)
 
     how = {"resume": resume, "progress": report, "accelerator": accelerator, "sample_sheet": sheet}
-    result = (derender_task.train if ours else train_baseline)(config, images, out, **how)
+    make = derender_task.train if isinstance(config, TrainConfig) else train_baseline
+    result = make(config, images, out, **how)
     leave()
     if page and this_rank_writes():
         from derender.report.run import Evidence, look_at_data, run_page
@@ -209,9 +209,8 @@ def finetune(
         ValueError: unknown labels, settings that do not fit, or a training that collapsed without a model.
     """
     out, report = Path(out), progress or (lambda _: None)
-    resume = bool(choices.get("resume"))
     config, accelerator = finetune_settings(out, **choices), device_named(device)
-    if not resume:
+    if not (resume := bool(choices.get("resume"))):
         refuse_taken(out)
     start = None if config.start is None else as_model(config.start, device="cpu")
     size, reading = config.model.network.image_size, Progress.of("reading", report)
@@ -225,16 +224,12 @@ def finetune(
     task = FinetuneTask(config, images.images, target_of(images, config), start)
     from derender.report.run import run_page, sample_sheet
 
-    run = train_task(
-        task, images, out, resume=resume, progress=report, accelerator=accelerator,
-        sample_sheet=lambda tuned, few: sample_sheet(tuned.model, few),
-    )  # fmt: skip
+    how = {"resume": resume, "progress": report, "accelerator": accelerator}
+    run = train_task(task, images, out, **how, sample_sheet=lambda tuned, few: sample_sheet(tuned.model, few))
     run_page(out).write(out / "report.html")
     if not (out / "model").is_dir():
         raise ValueError(f"{out} has no model: training collapsed before the first held-out score")
     tuned = load_finetuned(out, device=accelerator)
-    scores = score_finetuned(
-        tuned, task, began=config.start or "fresh weights", memory=memory,
-        progress=Progress.of("scoring", report),
-    )  # fmt: skip
+    began, scoring = config.start or "fresh weights", Progress.of("scoring", report)
+    scores = score_finetuned(tuned, task, began=began, memory=memory, progress=scoring)
     return Finetuned(run, scores, config.start)

@@ -187,10 +187,8 @@ class Sweep:
     def score(self, name: str, tables: Mapping[str, Sequence[Path]], file: Path, show: Show) -> None:
         """Write the scores of one set by all methods that have features, beside controls."""
         plan, scored, rows, questions = self.plan, self.plan.score[name], [], []
-        how = Options(
-            untrained_seeds=plan.untrained_seeds, resamples=plan.resamples, device=self.device,
-            cache=self.out / "memory", progress=show,
-        )  # fmt: skip
+        counts = plan.model_dump(include={"untrained_seeds", "resamples"})
+        how = Options(**counts, device=self.device, cache=self.out / "memory", progress=show)
         for method, files in tables.items():
             runs = tuple(map(FeatureTable.read, files))
             factors = plan.methods[method].features or (how.chosen if plan.kind(method) == OURS else None)
