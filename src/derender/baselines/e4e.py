@@ -134,8 +134,7 @@ class E4eEncoder(nn.Module):
         middle = self.doubled(coarse) + self.to_middle(at_8)
         fine = self.doubled(middle) + self.to_fine(at_4)
         sources = [coarse] * FIRST_MIDDLE + [middle] * (FIRST_FINE - FIRST_MIDDLE) + [fine] * len(self.heads)
-        free = zip(self.heads[: released + 1], sources, strict=False)
-        first, *added = (head(source) for head, source in free)
+        first, *added = (head(maps) for head, maps in zip(self.heads[: released + 1], sources, strict=False))
         same = len(self.heads) - 1 - len(added)
         return torch.stack([first, *(first + change for change in added), *[first] * same], dim=1)
 

@@ -152,8 +152,7 @@ class Stylegan(LoopModel):
         if not self.training:
             small = min(JUDGED_SIDE, images.shape[-1])
             both = images.float(), self.sample(len(images), run.generator)
-            rows, sampled = (adaptive_avg_pool2d(each, small).flatten(1) for each in both)
-            return {"energy": energy_distance(rows, sampled)}
+            return {"energy": energy_distance(*(adaptive_avg_pool2d(one, small).flatten(1) for one in both))}
         n, net, judge, objective = len(images), self.learner, self.discriminator, run.config.objective
         self.average(n, objective.average_images)
         step, real = int(self.steps) - 1, 2 * images - 1

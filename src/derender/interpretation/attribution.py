@@ -18,6 +18,7 @@ that of the maps at the image's size, each divided by its largest value.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from types import ModuleType
 from typing import Any
 
@@ -208,12 +209,10 @@ def sanity_check(
     """
     twins, result = [untrained_twin(model, seed) for seed in seeds], []
     asked = [(model, probe), (model, shuffled), *((twin, probe) for twin in twins)]
-    for method in methods:
-        for factor in probe.factors:
-            maps = (saliency(method, net, images, factor, one, targets) for net, one in asked)
-            own, learned, *fresh = maps
-            for changed, others in zip(CHANGES, (fresh, [learned], [own.roll(1, dims=0)]), strict=True):
-                result.append(similarity(method, factor, changed, own, others, images.shape[-1]))
+    for method, factor in product(methods, probe.factors):
+        own, learned, *fresh = (saliency(method, net, images, factor, one, targets) for net, one in asked)
+        for changed, others in zip(CHANGES, (fresh, [learned], [own.roll(1, dims=0)]), strict=True):
+            result.append(similarity(method, factor, changed, own, others, images.shape[-1]))
     return result
 
 
