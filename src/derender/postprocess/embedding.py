@@ -6,7 +6,6 @@ networks see images by fours, one thread a portion, and a scene is the same what
 
 import copy
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -32,14 +31,17 @@ from derender.scene.camera import constant
 from derender.scene.crop import back, crop_images, crop_scene
 from derender.storage.places import FITTING_FILE, WHITENING_FILE
 
-FEW, MOST = 4, 64
-"""Images in one call of a network, and in a portion: large ones take a third less time than fours."""
+FEW, MOST = 4, 64  # images in one call of a network, and in a portion: large ones take a third less time
 CELLS = 32  # of gradient directions along each side
 BLUR_PX, SCALE = 0.75, 0.2  # blur before differences; near the variation of activations (development halves)
 _DARK = 1 / 510  # half a grey level: shorter gradients are noise
 HISTOGRAM_CELLS, ORIENTATIONS = 10, 12  # of histograms of gradients: along each side, and in each
 HISTOGRAMS = HISTOGRAM_CELLS**2 * ORIENTATIONS
 Model = TypeVar("Model", bound="EmbeddingModel")
+Images = Float[Tensor, "n 3 h w"]
+Crops = Float[Tensor, "n 2 3"]
+Rows = Float[Tensor, "n _"]
+Codes = Mapping[str, Float[Tensor, "n code"]]
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,7 @@ class Features:
         """What finds the crops that a factor's feature is made of, if it is."""
         return self.whitening.framing if self.whitening is not None and self.mirrors(factor) else None
 
-    def __call__(
-        self, codes: Mapping[str, Float[Tensor, "n code"]], activations: Mapping[str, Float[Tensor, "n _"]]
-    ) -> dict[str, Float[Tensor, "n _"]]:
+    def __call__(self, codes: Codes, activations: Mapping[str, Rows]) -> dict[str, Rows]:
         """Features by factor, of encoder outputs and activations; codes alone may be a ValueError."""
         features = {**codes, **(self.whitening(activations) if self.whitening is not None else {})}
         if self.fitting is not None:
@@ -124,8 +124,8 @@ class EmbeddingModel(nn.Module):
     factors: tuple[Factor, ...]
     nets: Any  # a `FactorNet` for each, by name, in an `nn.ModuleDict`
     settings: ModelSettings
-    encode: Callable[[Float[Tensor, "n 3 h w"]], dict[str, Float[Tensor, "n code"]]]
-    decode: Callable[[Mapping[str, Float[Tensor, "n code"]]], Scene]
+    encode: Callable[[Images], dict[str, Float[Tensor, "n code"]]]
+    decode: Callable[[Codes], Scene]
     render: Callable[[Scene], Rendering]
 
     def __init__(self, features: Features | None):
@@ -145,24 +145,27 @@ class EmbeddingModel(nn.Module):
             raise
 
     @property
-    @abstractmethod
-    def image_size(self) -> int: ...
+    def image_size(self) -> int:
+        """Side of the images the networks take, in pixels."""
+        return self.settings.network.image_size
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
 
     def balanced(self, scene: Scene) -> Scene:
         """A decoded scene whose brightness the model's prior, if any, shares between albedo and light."""
         prior = self.settings.brightness
         return scene if prior is None else prior(scene)
 
-    def framed(
-        self, images: Float[Tensor, "n 3 h w"]
-    ) -> tuple[Float[Tensor, "n 3 h w"], Float[Tensor, "n 2 3"] | None]:
+    def framed(self, images: Images) -> tuple[Images, Crops | None]:
         """Images in the crops in which the model expects its object, and the crops if it looks for them."""
         if self.whitening is None or self.whitening.framing is None:
             return images, None
         crops = self.whitening.framing.crops(images)
         return crop_images(images, crops), crops
 
-    def placed(self, scene: Scene, crops: Float[Tensor, "n 2 3"] | None) -> Scene:
+    def placed(self, scene: Scene, crops: Crops | None) -> Scene:
         """The scenes that whole images show, of scenes found in ``crops`` of them: cameras move back."""
         if crops is None or "camera" not in scene.parameters:
             return scene
@@ -190,17 +193,17 @@ class EmbeddingModel(nn.Module):
         """A model that shares these weights and whose features are the codes."""
         return self.with_features(Features())
 
-    def embed(self, images: GivenImages) -> dict[str, Float[Tensor, "n _"]]:
+    def embed(self, images: GivenImages) -> dict[str, Rows]:
         """One feature per factor, by name: as ``features`` makes it, else the code.
 
         Images are (N, 3, S, S) in 0..1, or whatever `as_batch` takes: paths, Pillow images, arrays.
         """
-        images = as_batch(images, self.image_size, next(self.parameters()).device)
+        images = as_batch(images, self.image_size, self.device)
         if self.whitening is None and not self.features.fits_scenes:
             return self.encode(images)
         return self.features_from(self.activations(images, codes=False))
 
-    def activations(self, images: Float[Tensor, "n 3 h w"], codes: bool = True) -> dict[str, Tensor]:
+    def activations(self, images: Images, codes: bool = True) -> dict[str, Tensor]:
         """Encoder activations (N, D) of images in 0..1, by factor: the code, then the last spatial map.
 
         Where ``features`` needs them, the mirror image's follow, and the fitted scene's under
@@ -217,9 +220,9 @@ class EmbeddingModel(nn.Module):
         return result
 
     def factor_activations(
-        self, name: str, images: Float[Tensor, "n 3 h w"], gradients: bool | None = None,
-        framed: Float[Tensor, "n 3 h w"] | None = None, codes: bool = True,
-    ) -> Float[Tensor, "n _"]:  # fmt: skip
+        self, name: str, images: Images, gradients: bool | None = None,
+        framed: Images | None = None, codes: bool = True,
+    ) -> Rows:  # fmt: skip
         """``activations`` for one factor, without coordinates.
 
         Where ``features`` take another crop or the canonical view, its activations follow the code, if
@@ -241,33 +244,27 @@ class EmbeddingModel(nn.Module):
                 parts += [gradient_directions(one), gradient_histograms(one)]
         return torch.cat(parts, dim=1)
 
-    def surface(
-        self, images: Float[Tensor, "n 3 h w"]
-    ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n 6"]]:
+    def surface(self, images: Images) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n 6"]]:
         """Depth and camera of images in 0..1, as ``decompose`` finds them in images in its crops."""
-        rows = {row.parameter: row for row in self.factors}
-        depth, camera = (
-            rows[kind].to_parameter(self.nets[rows[kind].name](images), self.settings.ranges)
-            for kind in ("depth", "camera")
-        )
+        rows, ranges = {row.parameter: row for row in self.factors}, self.settings.ranges
+        both = rows["depth"], rows["camera"]
+        depth, camera = (row.to_parameter(self.nets[row.name](images), ranges) for row in both)
         return depth, camera
 
-    def canonical_view(self, images: GivenImages) -> Float[Tensor, "n 3 h w"]:
+    def canonical_view(self, images: GivenImages) -> Images:
         """The images' own pixels on their surface, seen from the front (`unwarp`); images as for `embed`."""
-        return self.frontal(self.framed(as_batch(images, self.image_size, next(self.parameters()).device))[0])
+        return self.frontal(self.framed(as_batch(images, self.image_size, self.device))[0])
 
-    def frontal(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    def frontal(self, images: Images) -> Images:
         """The canonical view of images of the model's size; renderings may exceed 1."""
         return unwarp(images, *self.surface(images), self.settings.ranges.fov_deg)
 
-    def codes(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n code"]]:
+    def codes(self, activations: Mapping[str, Rows]) -> dict[str, Float[Tensor, "n code"]]:
         """The codes that activations begin with: ``encode`` of the same images."""
         names = [factor.name for factor in self.factors if factor.name in activations]
         return {name: activations[name][:, : self.nets[name].code_size] for name in names}
 
-    def features_from(
-        self, activations: Mapping[str, Float[Tensor, "n _"]]
-    ) -> dict[str, Float[Tensor, "n _"]]:
+    def features_from(self, activations: Mapping[str, Rows]) -> dict[str, Rows]:
         """``embed`` of the images that these activations belong to; codes alone are a ValueError."""
         return self.features(self.codes(activations), activations)
 
@@ -277,11 +274,11 @@ class EmbeddingModel(nn.Module):
         Some five times as slow as ``decompose``, with a smaller error. On a CPU a scene depends neither on
         other images nor on threads. Without a fitting (``derender whiten`` makes one): a ValueError.
         """
-        framed, crops = self.framed(as_batch(images, self.image_size, next(self.parameters()).device))
+        framed, crops = self.framed(as_batch(images, self.image_size, self.device))
         fitted = self._fitted(framed, steps)
         return replace(fitted, scene=self.placed(fitted.scene, crops))
 
-    def _fitted(self, images: Float[Tensor, "n 3 h w"], steps: int) -> Fitted:
+    def _fitted(self, images: Images, steps: int) -> Fitted:
         fitting, nets = self.features.required_fitting(), self.nets
         rows = [row for row in self.factors if not (row.mirrored or row.parameter in ("light", "camera"))]
         ranged = [lambda raw, own=row: own.to_parameter(raw, self.settings.ranges) for row in rows]
@@ -301,7 +298,7 @@ class EmbeddingModel(nn.Module):
         return replace(result, scene=self.balanced(result.scene))
 
 
-def gradient_directions(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n directions"]:
+def gradient_directions(images: Images) -> Float[Tensor, "n directions"]:
     """Unit vectors (right, down) of the gradient of the mean of colours, averaged over 32x32 cells.
 
     Slow changes of light turn them little (Gradientfaces, Zhang et al., TIP 2009). Images are in 0..1, at
@@ -318,7 +315,7 @@ def gradient_directions(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n di
     return SCALE * adaptive_avg_pool2d(unit, CELLS).flatten(1)
 
 
-def gradient_histograms(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n histograms"]:
+def gradient_histograms(images: Images) -> Float[Tensor, "n histograms"]:
     """Histograms of 12 orientations of the gradient of the mean of colours, in 10x10 cells.
 
     Each is divided by the root mean square of its 3x3 neighbours, also where it is dark (after Dalal and
@@ -338,7 +335,7 @@ def gradient_histograms(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n hi
     return (cells / (near + 1e-10).sqrt()).clamp(max=0.4).flatten(1)
 
 
-def _by_portions(function: Callable[[Tensor], Fitted], images: Float[Tensor, "n 3 h w"]) -> list[Fitted]:
+def _by_portions(function: Callable[[Tensor], Fitted], images: Images) -> list[Fitted]:
     """Results of portions of images in order, the last one filled up to fours with its last image.
 
     The function is called by as many threads as torch has, each with one of torch's; on a GPU once, with all.

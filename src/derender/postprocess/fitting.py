@@ -21,9 +21,7 @@ from derender.settings import Settings
 from derender.storage.bounded import first_line, parse_json
 from derender.storage.tensors import read_described, write_tensors
 
-PARAMETERS = {"geometry": "depth", "albedo": "albedo"}
-"""Factors that are fitted within the morphable model, and what they fill."""
-
+PARAMETERS = {"geometry": "depth", "albedo": "albedo"}  # fitted within the morphable model: what they fill
 STEPS = 20  # twice as many bring the error down by half a percent more
 
 _START_LIMIT = 2.5  # standard deviations; predictions beyond are unreliable
@@ -139,8 +137,7 @@ def by_fours(rows: Float[Tensor, "n k"], matrix: Float[Tensor, "k m"]) -> Float[
 class Fitted:
     """Scenes fitted to images, and by factor their coordinates, in the training maps' standard deviations.
 
-    ``before`` and ``after`` are (N,) mean absolute errors where the surface is seen, each pixel's limited
-    softly.
+    ``before``, ``after``: (N,) mean absolute errors where the surface is seen, limited softly at each pixel.
     """
 
     scene: Scene
@@ -199,10 +196,8 @@ class Fitting(nn.Module):
         if steps < 1:
             raise ValueError(f"fitting needs 1 step or more, got {steps}")
         images, scene = images.detach().clone(), scene.map(lambda value: value.detach().clone())
-        coordinates = [
-            self.maps.coordinates(name, scene.parameters[name].float()).clamp(-_START_LIMIT, _START_LIMIT)
-            for name in PARAMETERS.values()
-        ]
+        known = [(name, scene.parameters[name].float()) for name in PARAMETERS.values()]
+        coordinates = [self.maps.coordinates(*one).clamp(-_START_LIMIT, _START_LIMIT) for one in known]
         loose = [raw.float().clamp(-0.99, 0.99).atanh() for _, raw, _ in further]
         start = [*coordinates, *loose, scene.light.float(), scene.camera.float()]
         sizes = [value.shape[1] for value in start]
@@ -296,10 +291,8 @@ class Fitting(nn.Module):
         tensors, metadata = read_described(file)
         try:
             settings = parse_json(metadata["settings"], FittingSettings)
-            means, axes = (
-                {name: tensors[f"maps.{name}_{part}"] for name in PARAMETERS.values()}
-                for part in ("mean", "axes")
-            )
+            means = {name: tensors[f"maps.{name}_mean"] for name in PARAMETERS.values()}
+            axes = {name: tensors[f"maps.{name}_axes"] for name in PARAMETERS.values()}
             fitting = cls(MorphableMaps(means, axes), settings, float(tensors["length"]))
         except (KeyError, ValidationError, RuntimeError) as error:
             raise ValueError(f"{Path(file).name} holds no fitting ({first_line(error)})") from error

@@ -17,8 +17,7 @@ from torch.nn.functional import adaptive_avg_pool2d, conv2d, linear, relu
 
 from derender.scene.crop import crop_images, parameters_of, similarities, within
 
-SIDE = 64
-"""Side in pixels at which images are looked at."""
+SIDE = 64  # in pixels, at which images are looked at
 STRIDES, WIDTHS, HIDDEN = (2, 2, 1, 2, 2), (24, 48, 48, 96, 96), 128
 """Steps and channels of convolutions of 3 x 3, and channels between the two linear layers that follow."""
 ROUNDS = 2
@@ -31,11 +30,13 @@ DOUBT = 100.0  # an image stays where its squared answers over their variances a
 _LEAST_DEVIATION = 0.05  # of an image's pixels, by which they are divided
 
 
+Answers = Float[Tensor, "n 4"]
+
+
 class Framing(nn.Module):
     """Finds the crops of images in which a model expects its object.
 
-    ``tensors`` are "weight0", "bias0" and so on of the layers; a missing one, or another shape, is a
-    ValueError.
+    ``tensors`` are "weight0", "bias0" and so on; a missing one, or another shape, is a ValueError.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor]):
@@ -64,9 +65,7 @@ class Framing(nn.Module):
         doubt = DOUBT / (parameters / error).square().sum(dim=1, keepdim=True)
         return similarities(parameters * (1 - doubt).clamp(min=0))
 
-    def answers(
-        self, images: Float[Tensor, "n 3 64 64"]
-    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 4"]]:
+    def answers(self, images: Float[Tensor, "n 3 64 64"]) -> tuple[Answers, Answers]:
         """Parameters of the `similarities` that frame each image, looked at once, and their deviations."""
         seen = standardised(images)
         for layer, stride in enumerate(STRIDES):
@@ -79,7 +78,7 @@ class Framing(nn.Module):
         return self.get_buffer(f"weight{layer}"), self.get_buffer(f"bias{layer}")
 
 
-def limited(error: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+def limited(error: Answers) -> Answers:
     """Logarithms of deviations that are neither next to nothing nor next to infinite."""
     return error.clamp(-4, 2)
 

@@ -115,15 +115,11 @@ def fit_side_by_side(
     Arguments are as of `fit_projection`. The features of all have as much variance as those of the first.
     """
     sizes = [(size + place) // len(scatters) for place in range(len(scatters))]
-    fitted = [
-        fit_projection(one, directions, shrinkage, own, evenness)
-        for one, own in zip(scatters, sizes, strict=True)
-    ]
-    maps = [own.map.double() for own in fitted]
-    totals = [
-        (own.T @ (one.within + one.between) @ own).trace().clamp(min=_TINY)
-        for own, one in zip(maps, scatters, strict=True)
-    ]
+    pairs = zip(scatters, sizes, strict=True)
+    fitted = [fit_projection(one, directions, shrinkage, own, evenness) for one, own in pairs]
+    maps, spreads = [own.map.double() for own in fitted], [one.within + one.between for one in scatters]
+    both = zip(maps, spreads, strict=True)
+    totals = [(own.T @ spread @ own).trace().clamp(min=_TINY) for own, spread in both]
     scaled = [own * (totals[0] / total).sqrt() for own, total in zip(maps, totals, strict=True)]
     means, ratios = (torch.cat([getattr(own, part) for own in fitted]) for part in ("mean", "ratios"))
     return Projection(means, torch.block_diag(*scaled).float(), ratios.sort(descending=True).values)
@@ -134,8 +130,7 @@ class Whitening(nn.Module):
 
     A projection takes the first of the activations, as many as it has rows. Those of names in ``canonical``
     take the last, of the image's canonical view. Those of names in ``mirrored`` take the mean over an image
-    and its mirror image, whose activations follow. With a ``framing`` these take the last, of the image in
-    its crop.
+    and its mirror image, whose activations follow: with a ``framing`` the last, of the image in its crop.
     """
 
     def __init__(
@@ -162,12 +157,9 @@ class Whitening(nn.Module):
         return self.canonical | (self.mirrored if self.framing is not None else frozenset())
 
     def forward(self, activations: Mapping[str, Float[Tensor, "n _"]]) -> dict[str, Float[Tensor, "n _"]]:
-        return {
-            name: (self.inputs(name, activations[name]) - self.get_buffer(f"{name}_mean"))
-            @ self.get_buffer(f"{name}_map")
-            for name in self.names
-            if name in activations
-        }
+        taken = {name: self.inputs(name, activations[name]) for name in self.names if name in activations}
+        buffer = self.get_buffer
+        return {name: (own - buffer(f"{name}_mean")) @ buffer(f"{name}_map") for name, own in taken.items()}
 
     def size(self, name: str) -> int:
         """How many activations of an image a factor's projection takes."""
@@ -201,14 +193,12 @@ class Whitening(nn.Module):
         projections = {}
         for name in [key.removesuffix("_map") for key in tensors if key.endswith("_map")]:
             try:
-                mean, chart, ratios = (
-                    tensors[f"{name}_{part}"].float() for part in ("mean", "map", "ratios")
-                )
+                mean, axes, ratios = (tensors[f"{name}_{part}"].float() for part in ("mean", "map", "ratios"))
             except KeyError as error:
                 raise ValueError(f"it has no {error.args[0]!r}") from error
-            if chart.ndim != 2 or len(chart) != len(mean) or ratios.ndim != 1:
-                raise ValueError(f"{name}: a map of {tuple(chart.shape)} beside a mean of {len(mean)}")
-            projections[name] = Projection(mean, chart, ratios)
+            if axes.ndim != 2 or len(axes) != len(mean) or ratios.ndim != 1:
+                raise ValueError(f"{name}: a map of {tuple(axes.shape)} beside a mean of {len(mean)}")
+            projections[name] = Projection(mean, axes, ratios)
         alone = {name for name in projections if f"{name}{_ALONE}" in tensors or _MIRRORED not in tensors}
         canonical = {name for name in projections if f"{name}{_CANONICAL}" in tensors}
         own = {key.removeprefix(_FRAMING): tensors[key] for key in tensors if key.startswith(_FRAMING)}
