@@ -92,18 +92,9 @@ class Derenderer(EmbeddingModel, Shareable):
         return load(source, **rows)
 
     @property
-    def image_size(self) -> int:
-        """Side of the images the networks take, in pixels."""
-        return self.settings.network.image_size
-
-    @property
     def fov_deg(self) -> float:
         """Horizontal field of view of every image, in degrees."""
         return self.settings.ranges.fov_deg
-
-    @property
-    def device(self) -> torch.device:
-        return next(self.parameters()).device
 
     def encode(self, images: Float[Tensor, "n 3 h w"]) -> dict[str, Float[Tensor, "n code"]]:
         """One code per factor for images in 0..1, by factor name: what ``decode`` takes."""
@@ -136,9 +127,8 @@ class Derenderer(EmbeddingModel, Shareable):
 
     def mirror(self, scene: Scene) -> Scene:
         """The flipped twin of a scene: its maps mirrored left to right, everything else as it is."""
-        return scene.with_parameters(
-            **{f.parameter: scene.parameters[f.parameter].flip(-1) for f in self.factors if f.mirrored}
-        )
+        names = (factor.parameter for factor in self.factors if factor.mirrored)
+        return scene.with_parameters(**{name: scene.parameters[name].flip(-1) for name in names})
 
     def write(self, folder: Path) -> None:
         write_tensors(self.state_dict(), folder / files.WEIGHTS_FILE)
@@ -171,7 +161,9 @@ def load(
         settings = ModelSettings.model_validate(config["settings"])
     renderer = recorded_renderer(settings.renderer, renderer, source)
     factors = renderer.all_factors if factors is None else factors
-    files.check_factors(folder, config, [factor.name for factor in factors])
+    if (names := [factor.name for factor in factors]) != config["factors"]:
+        both = f"{', '.join(config['factors'])}, asked for {', '.join(names)}"
+        raise ValueError(f"{folder} holds factors {both}: pass its rows as factors=")
     with files.naming_damage(folder):
         model = files.read_weights(folder, lambda: Derenderer(settings, factors, renderer))
         model = model.with_features(Features.load(folder, model.image_size))

@@ -1,8 +1,7 @@
 """Files and folders that appear complete or not at all, and folders with checksums of their files.
 
 Both are written under another name beside their place and moved there at the end: a kill or a full disk
-leaves the previous content. The checksums of a sealed folder show a changed bit; they protect from no
-attacker.
+leaves the previous content. The checksums of a sealed folder show a changed bit, but stop no attacker.
 """
 
 import ctypes

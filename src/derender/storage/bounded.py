@@ -14,8 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 
 TEXT_LIMIT_BYTES = 8 << 20
 LINES_LIMIT_BYTES = 256 << 20
-FILE_LIMIT_BYTES = 512 << 20
-"""No image and no member of an archive larger than this is read: a bound on what a zip bomb can unpack to."""
+FILE_LIMIT_BYTES = 512 << 20  # of images and members of archives: bounds what a zip bomb can unpack to
 YAML_LIMIT, MOST_VALUES, DEEPEST, LONGEST_VALUE = 1 << 18, 20_000, 50, 10_000
 """Of YAML: characters, values with aliases unfolded, levels, and characters of one value."""
 

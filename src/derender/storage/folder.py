@@ -30,9 +30,8 @@ def texts_beside(folder: Path | None, tensors: Mapping[str, Tensor]) -> dict[str
     stored: dict[str, Tensor] = {}
     for name in TENSOR_FILES:
         stored |= read_tensors(folder / name) if (folder / name).is_file() else {}
-    if stored.keys() != tensors.keys() or any(
-        not torch.equal(stored[name].to(value), value) for name, value in tensors.items()
-    ):
+    equal = (name in stored and torch.equal(stored[name].to(own), own) for name, own in tensors.items())
+    if len(stored) != len(tensors) or not all(equal):
         return {}
     files = (folder / name for name in TEXT_FILES)
     return {file.name: read_text(file) for file in files if file.is_file()}
@@ -51,10 +50,7 @@ def saved_config(folder: Path) -> dict[str, Any]:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """``config.json`` of a saved model: its ``factors`` and ``settings``.
-
-    A ValueError: it is damaged, of a newer version, or of a baseline.
-    """
+    """``factors`` and ``settings`` of a saved model; ValueError: damaged, newer, or of a baseline."""
     config = saved_config(folder)
     if "baseline" in config:
         name = config["baseline"]
@@ -66,14 +62,6 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")
     return config
-
-
-def check_factors(folder: Path, config: Mapping[str, Any], factors: Sequence[str]) -> None:
-    """A ValueError where a saved model's configuration is of other factors."""
-    names = config["factors"]
-    if names != list(factors):
-        both = f"{', '.join(names)}, asked for {', '.join(factors)}"
-        raise ValueError(f"{folder} holds factors {both}: pass its rows as factors=")
 
 
 def write_config(folder: Path, factors: Sequence[str], settings: Settings) -> None:

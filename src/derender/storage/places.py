@@ -54,13 +54,9 @@ def bundled(name: str) -> dict[str, Any]:
     folder = PRETRAINED / name
     network = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["settings"]["network"]
     card = (folder / CARD_FILE).read_text(encoding="utf-8")
-    size = sum(file.stat().st_size for file in folder.iterdir())
-    return {
-        "name": name,
-        "image_size": network["image_size"],
-        "megabytes": round(size / 1e6),
-        "about": re.split(r" ?[(:.\n]", card[card.index("**Trained on**") :].replace("**", ""))[0],
-    }
+    about = re.split(r" ?[(:.\n]", card[card.index("**Trained on**") :].replace("**", ""))[0]
+    size = round(sum(file.stat().st_size for file in folder.iterdir()) / 1e6)
+    return {"name": name, "image_size": network["image_size"], "megabytes": size, "about": about}
 
 
 def model_folder(source: str | Path) -> Path:

@@ -68,9 +68,11 @@ class Shareable:
     ) -> str:  # fmt: skip
         """Upload the model to the Hugging Face Hub as ``save_pretrained`` writes it; returns its address.
 
-        A ValueError: no card, data and licence; PermissionError, ConnectionError: the Hub refuses or is not
-        reached.
+        ValueError: no card, data and licence; PermissionError: the Hub refuses; ConnectionError: no Hub.
         """
+        from huggingface_hub import HfApi
+        from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalTokenNotFoundError
+
         beside = texts_beside(self.source, self.tensors())
         own = CARD_FILE in beside and not (data or licence or scores)  # part of one would drop the licence
         if not (card or (data and licence) or own):
@@ -81,7 +83,23 @@ class Shareable:
         card = card or self._card(beside, repository, data, licence, scores)
         with TemporaryDirectory() as place:
             folder = self.save_pretrained(Path(place) / "model", card=card, licence=licence)
-            return upload(folder, repository, private=private, token=token)
+            hub = HfApi(token=token)
+            try:
+                made = hub.create_repo(repository, private=private, exist_ok=True)
+                hub.upload_folder(repo_id=made.repo_id, folder_path=folder, commit_message="A derender model")
+            except HFValidationError as error:
+                raise ValueError(f"{repository!r} is no name on the Hub: give OWNER/NAME") from error
+            except (HfHubHTTPError, LocalTokenNotFoundError) as error:
+                raise PermissionError(
+                    f"the Hub refuses {repository} ({' '.join(str(error).split())}): log in with "
+                    "'hf auth login' or pass token=, with the right to write there"
+                ) from error
+            except Exception as error:  # the client's HTTP library decides what a broken connection raises
+                raise ConnectionError(
+                    f"the Hub cannot be reached ({type(error).__name__}: {error}); nothing is lost: "
+                    "model.save_pretrained writes the same files to a folder"
+                ) from error
+        return str(made)
 
     def _card(self, beside: Mapping[str, str], title: str, *stated: str | None) -> str:
         """The card that lies beside the weights, unless data, licence or scores are stated."""
@@ -96,34 +114,6 @@ class Shareable:
         code = f'```python\nimport derender\n\nmodel = derender.load("{title}"{own})\n```'
         lines = (f"**{name}**: {text or 'not stated'}" for name, text in parts.items())
         return "\n\n".join([f"# {title}", does, code, *lines]) + "\n"
-
-
-def upload(folder: Path, repository: str, *, private: bool, token: str | None) -> str:
-    """Put a folder's files into a repository, which is made where there is none; gives its address.
-
-    A ValueError: that is no name; a PermissionError: the Hub refuses; a ConnectionError: it cannot be
-    reached.
-    """
-    from huggingface_hub import HfApi
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalTokenNotFoundError
-
-    hub = HfApi(token=token)
-    try:
-        made = hub.create_repo(repository, private=private, exist_ok=True)
-        hub.upload_folder(repo_id=made.repo_id, folder_path=folder, commit_message="A derender model")
-    except HFValidationError as error:
-        raise ValueError(f"{repository!r} is no name on the Hub: give OWNER/NAME") from error
-    except (HfHubHTTPError, LocalTokenNotFoundError) as error:
-        raise PermissionError(
-            f"the Hub refuses {repository} ({' '.join(str(error).split())}): log in with 'hf auth login' or "
-            "pass token=, with the right to write there"
-        ) from error
-    except Exception as error:  # what a broken connection raises changes with the client's HTTP library
-        raise ConnectionError(
-            f"the Hub cannot be reached ({type(error).__name__}: {error}); nothing is lost: "
-            "model.save_pretrained writes the same files to a folder"
-        ) from error
-    return str(made)
 
 
 def with_metadata(card: str, licence: str | None = None) -> str:
@@ -149,9 +139,7 @@ def _errors_in_words(errors: str) -> str:
     )
 
 
-KINDS = ("bytes", "float16")
-"""How the large maps of whitening and fitting are kept; weights are kept in float16 by both."""
-
+KINDS = ("bytes", "float16")  # of the large maps of whitening and fitting; weights are float16 in both
 _LARGE = re.compile(r"\w+_map|maps\.\w+_axes|framing\.weight\d")
 
 
@@ -160,10 +148,10 @@ def pack_model(
 ) -> dict[str, int]:
     """Write a model in fewer bytes, with what lies beside its weights; complete or not at all.
 
-    Gives the bytes of the tensors' files "before" and "after".
-    ``maps`` are kept as "bytes", a 127th of the largest number of each slice apart, or "float16". A
-    FileExistsError: ``folder`` exists, without ``overwrite``; a FileNotFoundError: no model is at ``source``;
-    a ValueError: it is damaged, or a weight is no number of half precision.
+    Gives the bytes of the tensors' files "before" and "after". ``maps`` are kept as "bytes", a 127th of the
+    largest number of each slice apart, or "float16". A FileExistsError: ``folder`` exists, without
+    ``overwrite``; a FileNotFoundError: no model is at ``source``; a ValueError: it is damaged, or a weight is
+    no number of half precision.
     """
     require_known("kind of maps", maps, KINDS)
     own, sizes = model_folder(source), {"before": 0, "after": 0}
@@ -175,12 +163,16 @@ def pack_model(
             tensors, metadata = read_described(own / file)
             small = dict(tensors)
             for name, value in tensors.items():
-                if file == files.WEIGHTS_FILE:
-                    small[name] = _half(name, value) if value.is_floating_point() else value
-                elif _LARGE.fullmatch(name) and maps == "bytes":
+                weight = file == files.WEIGHTS_FILE and value.is_floating_point()
+                if maps == "bytes" and _LARGE.fullmatch(name):
                     small[name], small[name + UNIT] = packed(value.float(), along=0)
-                elif _LARGE.fullmatch(name):
-                    small[name] = _half(name, value)
+                elif weight or _LARGE.fullmatch(name):
+                    small[name] = value.half()
+                    if not bool(small[name].isfinite().all()):
+                        raise ValueError(
+                            f"{name} has numbers that half precision cannot hold (beyond 65,504, or NaN), "
+                            "so this model cannot be packed: its training went wrong, train it again"
+                        )
             write_tensors(small, temporary / file, metadata)
             sizes["before"] += (own / file).stat().st_size
             sizes["after"] += (temporary / file).stat().st_size
@@ -188,13 +180,3 @@ def pack_model(
             if (own / file).is_file():
                 (temporary / file).write_bytes(read_bounded(own / file))
     return sizes
-
-
-def _half(name: str, value: Tensor) -> Tensor:
-    half = value.half()
-    if not bool(half.isfinite().all()):
-        raise ValueError(
-            f"{name} has numbers that half precision cannot hold (beyond 65,504, or NaN), so this model "
-            "cannot be packed: its training went wrong, train it again"
-        )
-    return half

@@ -20,22 +20,20 @@ from torch import Tensor
 from derender.storage.atomic import write_whole
 from derender.storage.bounded import require_regular
 
+Tensors = Mapping[str, Tensor]
 CHECKSUM = "crc32"
 SAFE_SINCE = "2.10.0"  # version of PyTorch that reads pickles of weights safely
 LIMIT_BYTES, _HEADER_BYTES = 2 << 30, 1 << 20
-UNIT = ".unit"
-"""A tensor of bytes is in the unit that lies beside it under its name and this: read as their product."""
+UNIT = ".unit"  # after a tensor's name: the unit that its bytes are in; read as their product
 
 
-def write_tensors(
-    tensors: Mapping[str, Tensor], file: str | Path, metadata: Mapping[str, str] | None = None
-) -> None:
+def write_tensors(tensors: Tensors, file: str | Path, metadata: Mapping[str, str] | None = None) -> None:
     """Write tensors with their checksum, whole or not at all; ``metadata`` is kept beside it."""
     plain = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     write_whole(file, save(plain, {**(metadata or {}), CHECKSUM: checksum(plain)}))
 
 
-def read_tensors(file: str | Path, like: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+def read_tensors(file: str | Path, like: Tensors | None = None) -> dict[str, Tensor]:
     """The tensors of a safetensors file, on the CPU; damage is a ValueError, no file an OSError.
 
     A file much larger than the expected tensors, which are ``like`` these, or than 2 GiB is not opened.
@@ -43,9 +41,7 @@ def read_tensors(file: str | Path, like: Mapping[str, Tensor] | None = None) -> 
     return read_described(file, like)[0]
 
 
-def read_described(
-    file: str | Path, like: Mapping[str, Tensor] | None = None
-) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_described(file: str | Path, like: Tensors | None = None) -> tuple[dict[str, Tensor], dict[str, str]]:
     """As ``read_tensors``, with the file's metadata."""
     expected = None if like is None else sum(value.numel() for value in like.values())
     most = LIMIT_BYTES if expected is None else min(LIMIT_BYTES, 16 * expected + _HEADER_BYTES)
@@ -70,7 +66,7 @@ def read_described(
     return plain, metadata
 
 
-def check_fit(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+def check_fit(weights: Tensors, expected: Tensors) -> None:
     """Raise ValueError where a weight is missing, has another shape or is not expected; names the first."""
     for name, value in expected.items():
         if name not in weights:
@@ -102,7 +98,7 @@ def require_plain(tensors: Mapping[str, Any], file: Path) -> None:
             raise ValueError(f"{file}: {name!r} claims {tuple(value.shape)}, more numbers than are stored")
 
 
-def checksum(tensors: Mapping[str, Tensor]) -> str:
+def checksum(tensors: Tensors) -> str:
     """Eight hexadecimal digits that change with any name, kind, shape or bit."""
     result = 0
     for name, value in sorted(tensors.items()):
@@ -118,8 +114,7 @@ def reads_safely() -> bool:
 
 
 def check_pickle(file: Path) -> None:
-    """Raise ValueError for a ``file`` that is irregular, above 2 GiB, unpacks to more than it holds, or makes
-    the installed PyTorch run code."""
+    """ValueError: a file is irregular, above 2 GiB, unpacks to more, or makes this PyTorch run code."""
     try:
         size = require_regular(file, LIMIT_BYTES)
         if zipfile.is_zipfile(file):
