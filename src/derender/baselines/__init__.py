@@ -120,6 +120,5 @@ def embed_baseline(
     widths, origin = {name: table.factors[name].shape[1]}, {**table.origin}
     origin |= {} if part == "all" else {"part": part}
     replace(table, origin=origin).write(out)
-    facts = origin["data"], origin["layout"]
     counts = len(images.skipped), images.skipped[:LISTED_SKIPPED], len(images.duplicates), 0
-    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, *counts, *facts, kept)
+    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, *counts, kept)

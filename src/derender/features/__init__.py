@@ -1,8 +1,7 @@
 """Features extracted once, kept in one table, scored many times.
 
-table: the value; parquet: its file; extract: model and images in, features out; transformer: the same for
-scikit-learn; embedding: any images to a table in memory or a file (blocks: on the way there); neighbours:
-nearest rows by one factor.
+table: the value; parquet: its file; extract: model and images to features; transformer: for scikit-learn;
+embedding: images to a table in memory or a file (blocks: on the way there); neighbours: nearest rows.
 """
 
 import importlib
@@ -30,11 +29,8 @@ __all__ = [
     "search", "table_labels", "unlike_training",
 ]  # fmt: skip
 
-_HOME = {
-    **dict.fromkeys(("Embedded", "embed", "embed_to_file", "unlike_training"), "embedding"),
-    "search": "neighbours",
-    "DisentangledFeatures": "transformer",
-}
+_HOME = dict.fromkeys(("Embedded", "embed", "embed_to_file", "unlike_training"), "embedding")
+_HOME |= {"search": "neighbours", "DisentangledFeatures": "transformer"}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,7 +13,6 @@ import json
 import logging
 import pickle
 import re
-import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
@@ -68,16 +67,9 @@ def local_blocks(
 
 
 class BlockEmbedder:
-    """Embeds blocks of ``size`` samples; best called in ascending order, as it reads the stream through once.
+    """Embeds blocks of ``size`` samples; best in ascending order, as it reads the stream through once."""
 
-    ``threads`` are torch's; None leaves them.
-    """
-
-    def __init__(
-        self, model: Any, open_stream: OpenStream, size: int, fit: str = "crop", threads: int | None = None
-    ):
-        if threads is not None:
-            torch.set_num_threads(threads)
+    def __init__(self, model: Any, open_stream: OpenStream, size: int, fit: str = "crop"):
         self.model, self.size, self.fit = model, size, fit
         self.opened = ExitStack()
         self.stream = self.opened.enter_context(open_stream())
@@ -96,7 +88,8 @@ class BlockEmbedder:
             return embedded_block(self.model, decode_samples(start, samples, self.model.image_size, self.fit))
 
     def __call__(self, numbers: dict[str, Any]) -> dict[str, list[bytes]]:
-        """As Ray Data calls it: the first samples of blocks in, pickled blocks out."""
+        """As Ray Data calls it, on one core: the first samples of blocks in, pickled blocks out."""
+        torch.set_num_threads(1)
         return {"block": [pickle.dumps(self.embed(int(start))) for start in numbers["start"]]}
 
 
@@ -120,7 +113,7 @@ def ray_blocks(
     def blocks() -> Iterator[Block]:
         made = ray.data.from_items(starts, override_num_blocks=len(starts)).map_batches(
             BlockEmbedder,
-            fn_constructor_args=(model, open_stream, batch_size, fit, 1),
+            fn_constructor_args=(model, open_stream, batch_size, fit),
             batch_size=1,
             compute=ray.data.ActorPoolStrategy(size=workers),
             num_cpus=1,
@@ -186,8 +179,7 @@ def rows_of(block: Block, seen: set[bytes], keep_duplicates: bool = False) -> Ro
 
 
 class Parts:
-    """A folder of parts, made of ``plan``, anything JSON can hold. Parts of another plan are an error, or go
-    if the table is ``fresh``.
+    """A folder of parts, made of ``plan`` (JSON). Parts of another plan are an error, or go if ``fresh``.
 
     Attributes:
         following: the first sample that is in no part.
@@ -207,8 +199,8 @@ class Parts:
             try:
                 self._add(file, *_checked(file, number))
             except Damaged as problem:
-                went_on = f"going on from the {self.rows:,} rows before it"
-                warnings.warn(f"{file} is damaged ({problem}): {went_on}", DamageNoticed, stacklevel=2)
+                text = f"{file} is damaged ({problem}): going on from the {self.rows:,} rows before it"
+                warnings.warn(text, DamageNoticed, stacklevel=2)
                 for rest in files[number:]:
                     rest.unlink()
                 break
@@ -228,10 +220,7 @@ class Parts:
             if stored is not None:
                 differs = ", ".join(name for name in plan if stored.get(name) != plan[name])
                 how = f"that was made otherwise (differs in {differs or 'its version'})"
-            raise ValueError(
-                f"{self.folder} holds an unfinished table {how}: delete that folder, or add --force to "
-                "begin anew"
-            )
+            raise ValueError(f"{self.folder} holds an unfinished table {how}: delete it, or add --force")
         for entry in self.folder.iterdir():
             if entry.name != LOCK_FILE:
                 entry.unlink()
@@ -242,22 +231,16 @@ class Parts:
         self.copies += note["copies"]
         self.skipped += [Skipped(*one) for one in note["skipped"]]
 
-    def seen(self) -> set[bytes]:
-        """The digests of every row there is."""
-        return set(self._column("digest"))
-
-    def _column(self, name: str) -> Iterator[Any]:
+    def column(self, name: str) -> Iterator[Any]:
+        """The values of one column of the parts, such as "digest"."""
         for file in self.files:
             yield from pq.read_table(file, columns=[name])[name].to_pylist()
 
     def write(self, blocks: Sequence[Rows]) -> None:
         """Add a part: the rows of blocks in order."""
-        notes = [note for _, note in blocks]
-        note = {
-            "following": notes[-1]["following"],
-            "skipped": [one for note in notes for one in note["skipped"]],
-            "copies": sum(note["copies"] for note in notes),
-        }
+        skipped = [one for _, note in blocks for one in note["skipped"]]
+        copies = sum(note["copies"] for _, note in blocks)
+        note = {"following": blocks[-1][1]["following"], "skipped": skipped, "copies": copies}
         table = pa.concat_tables([table for table, _ in blocks if len(table)] or [blocks[0][0]])
         table = table.replace_schema_metadata({_KEY: json.dumps(note).encode()})
         with atomic_file(self.folder / "writing.parquet", durable=True) as temporary:
@@ -267,22 +250,17 @@ class Parts:
         del table
         pa.default_memory_pool().release_unused()
 
-    def tables(
-        self, origin: Mapping[str, Any], known: Mapping[str, np.ndarray] | None
-    ) -> Iterator[FeatureTable]:
+    def tables(self, origin: Mapping[str, Any], known: Mapping[str, Any] | None) -> Iterator[FeatureTable]:
         """The finished table, part by part; labels are the ``known`` ones of all images, or the stream's."""
-        texts = self._column("labels") if known is None else ()
+        texts = self.column("labels") if known is None else ()
         kinds = kinds_of(map(json.loads, texts))
         names = sorted(kinds, key="partition".__ne__)  # the owners' split first
         for file in self.files:
             table = pq.read_table(file)
             if not len(table):
                 continue
-            factors = {
-                name.removeprefix("factor "): factor_values(table[name], name, file)
-                for name in table.column_names
-                if name.startswith("factor ")
-            }
+            own = [name for name in table.column_names if name.startswith("factor ")]
+            factors = {name.removeprefix("factor "): factor_values(table[name], name, file) for name in own}
             if known is not None:
                 places = table["position"].to_numpy()
                 labels = {name: column[places] for name, column in known.items()}
@@ -290,10 +268,6 @@ class Parts:
                 rows = [json.loads(text) for text in table["labels"].to_pylist()]
                 labels = {name: column_of((row.get(name) for row in rows), kinds[name]) for name in names}
             yield FeatureTable(tuple(table["file"].to_pylist()), factors, labels, origin)
-
-    def remove(self) -> None:
-        """Delete the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def _checked(file: Path, number: int) -> tuple[int, dict[str, Any]]:

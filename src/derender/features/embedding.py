@@ -5,6 +5,7 @@ there. A stopped run continues from them with the same batches, and gives the sa
 """
 
 import hashlib
+import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -33,6 +34,8 @@ PART_ROWS = 4096  # a part is written when this many rows are there
 LISTED_SKIPPED = 20  # so many unreadable images are named; all are counted
 LOOKED_AT = 60  # images that tell whether a model suits them
 ENGINES = ("local", "ray")
+Source = Stream | ImageSet
+Facts = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -52,17 +55,15 @@ class Embedded:
     examples: tuple[Skipped, ...]
     copies: int
     resumed: int
-    source: str
-    layout: str
     kept: bool = False
 
     def describe(self) -> str:
         """One line: how many images of which data set, how many were left out or had been there."""
-        parts = [f"{counted(self.rows, 'images')} from {self.source} ({self.layout})"]
-        verb, counts = "kept" if self.kept else "dropped", (self.resumed, self.skipped, self.copies)
-        texts = "of them from the run before", "skipped", f"identical copies {verb}"
-        parts += [f"{count:,} {text}" for count, text in zip(counts, texts, strict=True) if count]
-        return ", ".join(parts)
+        copies = f"identical copies {'kept' if self.kept else 'dropped'}"
+        counts = {"of them from the run before": self.resumed, "skipped": self.skipped, copies: self.copies}
+        source, layout = self.origin["data"], self.origin["layout"]
+        further = [f"{count:,} {text}" for text, count in counts.items() if count]
+        return ", ".join([f"{counted(self.rows, 'images')} from {source} ({layout})", *further])
 
 
 def embed(
@@ -110,14 +111,12 @@ def embed_to_file(
         progress: called with (images done, estimated total) after every batch.
 
     Raises:
-        ValueError: no image can be read, a feature is not finite, the parts are of another run, or another
-            process writes them.
+        ValueError: no image can be read, a feature is not finite, or parts are another run's or in writing.
         KeyboardInterrupt: it was stopped; the message says what is kept.
     """
     path = Path(out)
     if path.suffix.lower() not in ("", ".parquet"):
-        how = "name it so (pandas.read_parquet reads it)"
-        raise ValueError(f"{out}: a feature table is a parquet file, {how}")
+        raise ValueError(f"{out}: a feature table is a parquet file, name it so (pandas reads it)")
     refuse_folder(path)
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
@@ -174,9 +173,7 @@ def _network(model: Any, device: str, fit_steps: int | None) -> tuple[Any, dict[
     return (as_model(model, fit_steps=fit_steps) if fit_steps is not None else model), {}
 
 
-def _plan(
-    net: Any, images: Stream | ImageSet, facts: Mapping[str, Any], reading: object, batch_size: int
-) -> dict[str, Any]:
+def _plan(net: Any, images: Source, facts: Facts, reading: object, batch_size: int) -> Facts:
     """Everything that a resumed run must have in common with the one before."""
     if isinstance(images, ImageSet):
         check_size(net, images.images)
@@ -190,9 +187,7 @@ def _plan(
     return {"origin": facts, "pictures": digest, **sizes, **machine}
 
 
-def _compute(
-    parts: Parts, blocks: Any, keep_duplicates: bool, limit: int | None, progress: Progress | None
-) -> None:
+def _compute(parts: Parts, blocks: Any, keep: bool, limit: int | None, progress: Progress | None) -> None:
     """Write the parts that are missing; what is computed is kept, and no folder stays without a part."""
     waiting: list[Rows] = []
     try:
@@ -203,10 +198,10 @@ def _compute(
                     waiting.clear()
                     pool.submit(parts.write, rows).result()  # in a thread that Ctrl-C does not stop
 
-            seen = parts.seen()
+            seen = set(parts.column("digest"))
             try:
                 for block in made:
-                    waiting.append(rows_of(block, seen, keep_duplicates))
+                    waiting.append(rows_of(block, seen, keep))
                     if sum(len(table) for table, _ in waiting) >= PART_ROWS:
                         write()
                     if progress is not None:
@@ -216,7 +211,7 @@ def _compute(
                 write()
     except BaseException as stopped:
         if not parts.files:
-            parts.remove()
+            shutil.rmtree(parts.folder, ignore_errors=True)
         elif isinstance(stopped, KeyboardInterrupt):
             kept = f"{parts.rows:,} rows are kept in {parts.folder}: the same command continues from there"
             raise KeyboardInterrupt(f"stopped by Ctrl-C; {kept}") from stopped
@@ -225,22 +220,18 @@ def _compute(
         progress(parts.following, parts.following)
 
 
-def _finish(
-    parts: Parts, path: Path, images: Stream | ImageSet, facts: dict[str, Any], resumed: int, kept: bool
-) -> Embedded:
+def _finish(parts: Parts, path: Path, images: Source, facts: Facts, resumed: int, kept: bool) -> Embedded:
     """Put the parts together, then delete them."""
     skipped = (*(images.passed_over if isinstance(images, Stream) else ()), *parts.skipped)
     if not parts.rows:
-        parts.remove()
+        shutil.rmtree(parts.folder, ignore_errors=True)
         more = f"; the first is {parts.skipped[0].file!r}: {parts.skipped[0].reason}" if parts.skipped else ""
         raise ValueError(f"no image in {images.source} ({images.layout}) can be read{more}")
     source = images if isinstance(images, ImageSet) else images.table
     tables = parts.tables(facts, None if source is None else table_labels(source))
     first = next(tables)
     write_tables(path, chain([first], tables))
-    parts.remove()
+    shutil.rmtree(parts.folder, ignore_errors=True)
     widths = {name: values.shape[1] for name, values in first.factors.items()}
     counts = (len(skipped), skipped[:LISTED_SKIPPED], parts.copies, resumed)
-    return Embedded(
-        path, parts.rows, widths, tuple(first.labels), facts, *counts, images.source, images.layout, kept
-    )
+    return Embedded(path, parts.rows, widths, tuple(first.labels), facts, *counts, kept)

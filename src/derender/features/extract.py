@@ -33,8 +33,7 @@ def map_batches(
 ) -> list[T]:  # fmt: skip
     """Results of a function of images in 0..1 on the model's device, batch by batch, without gradients.
 
-    The model is in evaluation mode meanwhile, and afterwards as it was. Images are (N, 3, H, W), uint8 or
-    float.
+    The model is in evaluation mode meanwhile, then as it was. Images are (N, 3, H, W), uint8 or float.
     """
     if batch_size < 1:
         raise ValueError(f"batch_size must be 1 or more, got {batch_size}")
@@ -88,11 +87,9 @@ def check_size(model: Any, images: np.ndarray, *, rendered: bool = False) -> Non
     """Images (N, 3, H, W) of another size than the model's are an error; a ``rendered`` set has one size."""
     size, (height, width) = model.image_size, images.shape[-2:]
     if (height, width) != (size, size):
-        again = f"render the set at that size (derender synth ... --image-size {size}), or give another model"
-        raise ValueError(
-            f"the images are {height}x{width}, the model takes {size}x{size}: "
-            f"{again if rendered else f'read them with image_size={size}'}"
-        )
+        how = f"render the set at that size (derender synth ... --image-size {size}), or give another model"
+        how = how if rendered else f"read them with image_size={size}"
+        raise ValueError(f"the images are {height}x{width}, the model takes {size}x{size}: {how}")
 
 
 def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:

@@ -22,10 +22,8 @@ from derender.storage.places import require_known
 
 METRICS = ("cosine", "euclidean")
 BLOCK_ROWS = 4096
-SAME_IMAGE = 1e-3
-"""Largest relative difference, in every factor, of one image embedded twice (batches and devices round)."""
-SAME_FITTED = 0.3
-"""The same of scenes optimised per image: after twenty steps 0.14 (measured); others are 0.6 away."""
+SAME_IMAGE = 1e-3  # largest relative difference, in every factor, of one image embedded twice (rounding)
+SAME_FITTED = 0.3  # the same of fitted scenes: after twenty steps 0.14 (measured); others are 0.6 away
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,7 @@ def search(
         table: a feature table or its parquet file.
         like: a file name of the table's rows, or with ``model`` an image file.
         factor: which factor has to be alike.
-        k: how many rows; all if there are fewer.
-        metric: cosine or euclidean.
+        k, metric: how many rows, all if there are fewer; cosine or euclidean.
         model: the model that made the table, for an image that is not in it.
         copies: find the image itself too, and copies of it.
         device: for a model that is loaded here.
@@ -129,10 +126,8 @@ def nearest(
     rows = named(table.factors, factor, "factor")
     require_known("metric", metric, METRICS)
     if len(query) != rows.shape[1]:
-        raise ValueError(
-            f"{factor} has {rows.shape[1]} numbers in this table, the query {len(query)}: "
-            "it was made by another model"
-        )
+        sizes = f"{rows.shape[1]} numbers in this table, the query {len(query)}"
+        raise ValueError(f"{factor} has {sizes}: it was made by another model")
     if not np.isfinite(query).all():
         raise ValueError("the query is not finite: check the image and the model that embedded it")
     if k < 1:

@@ -60,8 +60,7 @@ def as_arrow(content: FeatureTable) -> pa.Table:
         try:
             columns[name] = pa.array(plain, from_pandas=True)
         except pa.ArrowException as error:
-            mixed = f"label {name!r} mixes kinds of values that no column holds ({error})"
-            raise ValueError(mixed) from error
+            raise ValueError(f"label {name!r} mixes kinds that no column holds ({error})") from error
     names = {"factors": list(content.factors), "labels": list(content.labels)}
     described = {"format": FORMAT, **names, "origin": dict(content.origin)}
     metadata = {METADATA_KEY: json.dumps(described, ensure_ascii=False).encode()}

@@ -142,7 +142,5 @@ def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> Non
     for name, values in factors.items():
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():
-            raise ValueError(
-                f"factor {name!r} is not finite in {int((~finite).sum())} of {len(values)} rows, first in "
-                f"{files[int(np.argmin(finite))]}: drop these rows, or check the model that made them"
-            )
+            rows = f"{int((~finite).sum())} of {len(values)} rows, first in {files[int(np.argmin(finite))]}"
+            raise ValueError(f"factor {name!r} is not finite in {rows}: drop these, or check the model")

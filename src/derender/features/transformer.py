@@ -100,10 +100,8 @@ def as_pixels(X: Any, image_size: int) -> np.ndarray:
     if array.ndim == 4 and array.shape[1] != 3 and array.shape[3] == 3:
         array = np.moveaxis(array, 3, 1)
     if array.ndim != 4 or array.shape[1:] != (3, image_size, image_size):
-        raise ValueError(
-            f"expected images (N, 3, {image_size}, {image_size}) or (N, {image_size}, {image_size}, 3), "
-            f"got shape {array.shape}: resize them, or give a list of paths"
-        )
+        expected = f"expected images (N, 3, {image_size}, {image_size}) or (N, {image_size}, {image_size}, 3)"
+        raise ValueError(f"{expected}, got shape {array.shape}: resize them, or give a list of paths")
     if array.dtype == np.uint8:
         return array
     if array.dtype.kind != "f":
