@@ -33,7 +33,7 @@ _NAMES = {
 _HOME = {name: f"derender.{module}" for module, names in _NAMES.items() for name in names}
 _SUBMODULES = [
     *("scene", "render", "data", "networks", "objectives", "model", "training", "photo", "features"),
-    *("baselines", "evaluation", "interpretation", "report"),
+    *("baselines", "evaluate", "evaluation", "interpretation", "report"),
 ]
 
 __all__ = [
@@ -47,9 +47,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in _SUBMODULES:
-        return importlib.import_module(f"derender.{name}")
-    if name == "evaluate":
-        return importlib.import_module("derender.evaluation")
+        return importlib.import_module(f"derender.{'evaluation' if name == 'evaluate' else name}")
     raise AttributeError(f"module 'derender' has no attribute {name!r}")
 
 

@@ -1,10 +1,10 @@
 """Arguments of library calls: a model or its name, images or the address of a data set, a device by name.
 
-Every documented call takes either form and resolves it here: commands and Python users get the same checks
-and errors.
+Every documented call resolves either form here: commands and Python users get the same checks and errors.
 """
 
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -59,17 +59,15 @@ def as_images(
     Args:
         images: a set, or a folder, zip, ``PATH::SUBSET``, shards or Hugging Face id.
         image_size: side in pixels to read at.
-        dataset, limit: the layout's name, or "auto"; at most so many images, evenly spaced in the sorted
-        list.
+        dataset: the layout's name, or "auto".
+        limit: at most so many images, evenly spaced in the sorted list.
         part, model: "all", or the "train", "validation" or "test" part of a split, or of a model's.
         at_least, keep_duplicates: fewer images raise an error; keep every one of identical images.
         progress: called with (done, total) while reading.
     """
     if not isinstance(images, ImageSet):
-        images = read_images(
-            images, image_size, dataset=dataset, limit=limit, keep_duplicates=keep_duplicates,
-            progress=progress,
-        )  # fmt: skip
+        how: dict[str, Any] = {"dataset": dataset, "limit": limit, "keep_duplicates": keep_duplicates}
+        images = read_images(images, image_size, **how, progress=progress)
     return part_of(images, part, model).require(at_least)
 
 
@@ -101,8 +99,7 @@ def split_of(model: str | Path) -> SplitRecord | None:
 
 def copy_split(folder: Path, model: str | Path) -> None:
     """Record with a copy of ``model`` the split of its training, if that is known."""
-    record = split_of(model)
-    if record is not None:
+    if (record := split_of(model)) is not None:
         write_split(folder, record)
 
 

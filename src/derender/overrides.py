@@ -13,9 +13,7 @@ from derender.settings import Settings
 from derender.storage.bounded import parse_yaml
 from derender.storage.places import suggestion
 
-LISTED = 40
-"""Of so many settings at most an unknown one is told all names."""
-
+LISTED = 40  # of so many settings at most an unknown one is told all names
 SHORT = Repr()
 SHORT.maxstring = SHORT.maxother = 200  # a few lines of YAML can stand for gigabytes of text
 
@@ -76,9 +74,7 @@ def _read_value(text: str) -> Any:
     try:
         value = parse_yaml(text)
     except ValueError as error:
-        raise ValueError(
-            f"cannot read the value {text!r}: write a number, a word, true, false or [a, b]"
-        ) from error
+        raise ValueError(f"cannot read the value {text!r}: write a number, word, true or [a, b]") from error
     if isinstance(value, str):
         with suppress(ValueError):
             return float(value)
@@ -95,8 +91,7 @@ def _full_key(key: str, tree: Mapping[str, Any], names: Mapping[str, Any]) -> st
         return ending[0]
     if ending:
         raise ValueError(f"{key!r} could mean {' or '.join(ending)}: write it in full")
-    guess = suggestion(key, names) or suggestion(
-        key.rsplit(".", 1)[-1], [name.rsplit(".", 1)[-1] for name in names]
-    )
+    last, *lasts = (name.rsplit(".", 1)[-1] for name in (key, *names))
+    guess = suggestion(key, names) or suggestion(last, lasts)
     known = f"there are {', '.join(names)}" if len(names) <= LISTED else "--dry-run lists all of them"
     raise ValueError(f"unknown setting {key!r}{guess}: {known}")

@@ -10,11 +10,11 @@ from typing import TypeVar
 
 from pydantic import Field
 
-from derender.data import suggestion
 from derender.networks.encoders import NetworkSettings
 from derender.scene.brightness import BrightnessPrior
 from derender.scene.ranges import SceneRanges
 from derender.settings import Settings
+from derender.storage.places import require_known
 
 T = TypeVar("T")
 
@@ -53,6 +53,5 @@ MODEL_PRESETS: dict[str, ModelSettings] = {
 
 def named_preset(name: str, presets: Mapping[str, T]) -> T:
     """The preset of that name, or an error that names the nearest one."""
-    if name not in presets:
-        raise ValueError(f"no preset {name!r}{suggestion(name, presets)}: choose one of {', '.join(presets)}")
+    require_known("preset", name, tuple(presets))
     return presets[name]

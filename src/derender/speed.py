@@ -5,14 +5,12 @@ stands the share of its time that training waits for images of a mapped file. Le
 installed with derender: those are in benchmarks/.
 """
 
-import statistics
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from timeit import timeit
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,8 +28,7 @@ from derender.training.run_folder import environment
 from derender.training.step import training_step
 
 
-@dataclass(frozen=True)
-class SpeedPair:
+class SpeedPair(NamedTuple):
     """Ours against theirs: what is compared, how many of which unit each call does, and the two calls."""
 
     what: str
@@ -41,9 +38,7 @@ class SpeedPair:
     theirs: Callable[[], Any]
 
 
-def bench(
-    quick: bool = False, progress: Callable[[int, int, str], object] = lambda *_: None
-) -> dict[str, Any]:
+def bench(quick: bool = False, progress: Callable[..., object] = lambda *_: None) -> dict[str, Any]:
     """Measure the rasteriser, embedding beside training, clustering, and the wait for data.
 
     Args:
@@ -63,13 +58,12 @@ def bench(
 
 def measured(pair: SpeedPair, rounds: int) -> dict[str, Any]:
     """Both in turns, after a round to warm up: medians of speed, and of the ratio least and most."""
-    speeds = [
-        [pair.count / timeit(work, number=1) for work in (pair.ours, pair.theirs)] for _ in range(rounds + 1)
-    ]
-    ratios = [ours / theirs for ours, theirs in speeds[1:]]
-    ours, theirs = (statistics.median(column) for column in zip(*speeds[1:], strict=True))
+    turns = [[timeit(work, number=1) for work in (pair.ours, pair.theirs)] for _ in range(rounds + 1)]
+    speeds = pair.count / np.array(turns[1:])
+    ours, theirs = np.median(speeds, axis=0).tolist()
+    ratio, least, most = np.quantile(speeds[:, 0] / speeds[:, 1], [0.5, 0, 1]).tolist()
     facts = {"what": pair.what, "unit": pair.unit, "ours_per_second": ours, "theirs_per_second": theirs}
-    return {**facts, "ratio": statistics.median(ratios), "least": min(ratios), "most": max(ratios)}
+    return {**facts, "ratio": ratio, "least": least, "most": most}
 
 
 def rasteriser(quick: bool) -> SpeedPair:
@@ -124,9 +118,9 @@ def waiting_share(quick: bool) -> dict[str, float]:
     steps, batch, count = (4, 8, 256) if quick else (40, 32, 8_192)
     _, step = _training()
     with tempfile.TemporaryDirectory() as folder:
-        file, shape = Path(folder) / "images", (count, 3, 64, 64)
-        file.write_bytes(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8).tobytes())
-        images = torch.from_numpy(np.memmap(file, np.uint8, mode="c", shape=shape))
+        mapped = np.memmap(Path(folder) / "images", np.uint8, mode="w+", shape=(count, 3, 64, 64))
+        mapped[:] = np.random.default_rng(0).integers(0, 256, mapped.shape, dtype=np.uint8)
+        images = torch.from_numpy(mapped)
         batches = Batches(images, batch, seed=0, horizontal_flips=True)
         unaided = sum(timeit(partial(batches.read, position), number=1) for position in range(steps))
         reader = Reader(batches)
@@ -135,7 +129,7 @@ def waiting_share(quick: bool) -> dict[str, float]:
         took = sum(timeit(lambda at=at: step(reader.at(at)), number=1) for at in range(1, steps))
         waited = reader.waited_s - before
         reader.close()
-        del images, batches, reader  # the file stays mapped as long as one of them lives
+        del mapped, images, batches, reader  # the file stays mapped as long as one of them lives
     return {"seconds": took, "share": waited / took, "share_unaided": unaided / (took + unaided)}
 
 
