@@ -310,7 +310,7 @@ def test_bad_searches(table, tiny, photos, tmp_path, refused):
     assert "has no row '9.png'" in refused(*like, "9.png")
     assert "to search with an image, add a model" in refused(*like, photos / "0.png")
     assert "no.png is no image file" in refused(*like, tmp_path / "no.png", "--model", tiny)
-    assert "ends in .png" in refused(*like, "0.png", "--out", tmp_path / "sheet.gif")
+    assert "must end in .png" in refused(*like, "0.png", "--out", tmp_path / "sheet.gif")
     taken = tmp_path / "taken.png"
     taken.write_bytes(b"mine")
     assert "exists already" in refused(*like, "0.png", "--out", taken)

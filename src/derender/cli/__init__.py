@@ -8,42 +8,14 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Annotated
 
 import typer
 
 from derender import __version__
-from derender.cli import (
-    align,
-    bench,
-    compare,
-    copies,
-    decompose,
-    demo,
-    doctor,
-    edits,
-    embed,
-    evaluate,
-    explain,
-    finetune,
-    importing,
-    models,
-    report,
-    search,
-    synth,
-    train,
-    view,
-)
 from derender.cli.console import damage_as_notices, visible
-
-app = typer.Typer(
-    name="derender",
-    help="Decompose images into geometry, albedo, light and camera. Start with: derender demo",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
+from derender.cli.options import app
 
 _REMEDIES = {
     errno.ENOSPC: "; free some space and run the command again",
@@ -71,13 +43,12 @@ def _options(
     pass
 
 
-for one in (
-    demo.demo, align.align, doctor.doctor, train.train, copies.whiten, copies.refine, copies.unet,
-    models.pack, embed.embed, evaluate, explain.explain, finetune.finetune, importing.import_checkpoint,
-    compare.compare, models.models, report.report, decompose.decompose, edits.relight, edits.rotate,
-    edits.swap, decompose.mesh, search.search, view.view, synth, bench.bench,
+for module in (
+    "demo", "prepare", "train", "copies", "models", "embed", "explain", "finetune", "importing",
+    "compare", "report", "decompose", "edits", "search", "view", "bench", "evaluate.features",
+    "evaluate.encoders", "evaluate.scenes", "evaluate.photographs", "evaluate.robustness", "synth",
 ):  # fmt: skip
-    one.register(app)
+    import_module(f"derender.cli.{module}")
 _command = typer.main.get_command(app)
 
 
@@ -87,11 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "_DERENDER_COMPLETE" in os.environ:  # a shell asks for completions
         _command._main_shell_completion({}, "derender")  # answers and ends
     try:
-        with (
-            _command.make_context("derender", arguments) as context,  # typer's main hides what Ctrl-C said
-            damage_as_notices(),
-        ):
-            _command.invoke(context)
+        with damage_as_notices(), _command.make_context("derender", arguments) as context:
+            _command.invoke(context)  # typer's main hides what Ctrl-C said
         sys.stdout.flush()
         return 0
     except typer.Exit as end:

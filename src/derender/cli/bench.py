@@ -4,12 +4,11 @@ from derender.cli import options
 from derender.cli.console import progress_bar, result, write_json
 from derender.cli.options import command, option
 
+QUICK = "Smaller sizes and one round: a minute."
+
 
 @command("bench", "bench --quick --json speed.json")
-def bench(
-    quick: bool = option(False, "Smaller sizes and one round: a minute.", "--quick"),
-    json_file: options.Json = None,
-) -> None:
+def bench(quick: bool = option(False, QUICK, "--quick"), json_file: options.Json = None) -> None:
     """Measure speed on this machine, as ratios: rasteriser, embedding beside training, clustering."""
     from derender.speed import bench as measure
 

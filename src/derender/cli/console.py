@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from math import inf
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich import progress as bars
@@ -20,15 +19,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from derender.storage.atomic import DamageNoticed
+from derender.storage.atomic import DamageNoticed, write_whole
 
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.evaluation.score_table import ScoreTable
 
-NAMED = 5
-"""So many unreadable images are named."""
-
+NAMED = 5  # so many unreadable images are named
+WHERE_ALL = "(derender doctor --json FILE names all)"
 PLAIN_LINE_EVERY_SECONDS = 30.0
 
 
@@ -54,9 +52,7 @@ def visible(text: str, kept: str = "\n") -> str:
     return "".join(char if char in kept or char.isprintable() else repr(char)[1:-1] for char in text)
 
 
-def report_images(
-    images: "ImageSet", word: str = "skipped", rest: str = "(derender doctor --json FILE names all)"
-) -> None:
+def report_images(images: "ImageSet", word: str = "skipped", rest: str = WHERE_ALL) -> None:
     """What was read, and the first of what was left out by name."""
     first = (f"{word} {visible(row.file, '')}: {row.reason}" for row in images.skipped[:NAMED])
     notice(images.describe(), *first)
@@ -67,8 +63,7 @@ def report_images(
 @contextmanager
 def damage_as_notices() -> Iterator[None]:
     """Within the block the library's warnings of passed-over damage are notes at the terminal."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", DamageNoticed)
+    with warnings.catch_warnings(action="always", category=DamageNoticed):
         show = warnings.showwarning
 
         def say_or_show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
@@ -144,22 +139,7 @@ def write_json(target: str | None, values: Mapping[str, Any]) -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
     else:
-        from derender.storage.atomic import write_whole
-
         write_whole(target, text)
-
-
-def refuse_existing_file(path: Path, force: bool) -> None:
-    """Refuse a folder, and to write over an existing file unless told to."""
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name a file to write")
-    refuse_existing(path, force)
-
-
-def refuse_existing(path: Path, force: bool) -> None:
-    """Refuse to write over an existing file or folder unless told to."""
-    if path.exists() and not force:
-        raise FileExistsError(f"{path} exists already: choose another name, or add --force to replace it")
 
 
 def duration(seconds: float) -> str:

@@ -35,8 +35,7 @@ def refine(images: PartOfImages, model: TrainedModel, out: OutModel, output: Out
         f"{errors['before']:.4f}, fitted {errors['fitted']:.4f}"
     )
     for name, gap in scores["gaps"].items():
-        away = f"{gap['now']:.2f} mean deviations away from fitted scenes"
-        notice(f"{name}: {away}, before {gap['before']:.2f}")
+        notice(f"{name}: {gap['now']:.2f} mean deviations from fitted scenes, before {gap['before']:.2f}")
 
 
 @command("unet", "unet photos/ --model faces-64 --out faces-unet")

@@ -42,9 +42,7 @@ def demo(
                 story = run_demo(folder, settings, **how)
                 demo_page(story).write(folder / "report.html")
     except TrainingInterrupted as stop:
-        raise KeyboardInterrupt(
-            f"stopped; run derender demo again to start over ({folder} can be deleted)"
-        ) from stop
+        raise KeyboardInterrupt(f"stopped: run derender demo again ({folder} can be deleted)") from stop
     if story is not None:
         for name, table in score_tables(story).items():
             show_scores(table, json_file)

@@ -26,12 +26,11 @@ def relight(
     from derender.report.edits import relit, relit_video
 
     opener = model.opener(how, EDIT_SIZE, whole=True)
-    others = [] if like is None else [opener.open(like)]
-    moves: dict[str, Any] = {"reach_deg": reach, "pitch_deg": pitch, "strength": strength}
-    moves["like"] = others[0] if others else None
+    donor = None if like is None else opener.open(like)
+    moves: dict[str, Any] = {"reach_deg": reach, "pitch_deg": pitch, "strength": strength, "like": donor}
     edit = partial(relit, opener.model, **moves, film=film.single(files.suffix))
     video = partial(relit_video, **moves, hold=film.hold)
-    files.edit(opener, edit, output, beside=others, video=video)
+    files.edit(opener, edit, output, beside=[donor] if donor else [], video=video)
 
 
 @command("rotate", "rotate --model runs/faces me.jpg --reach 45 --out rotated/")

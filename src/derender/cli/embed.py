@@ -5,7 +5,7 @@ from pathlib import Path
 
 from derender.baselines import BASELINES
 from derender.cli import options
-from derender.cli.console import NAMED, notice, progress_bar, refuse_existing_file, visible
+from derender.cli.console import NAMED, notice, progress_bar, visible
 from derender.cli.options import command, option
 from derender.storage.places import counted
 
@@ -42,7 +42,7 @@ def embed(
     Images are read, embedded and written as they come, so memory does not grow with their number. A stopped
     run continues where it was when the command is given again.
     """
-    refuse_existing_file(out, output.force)
+    output.check(out)
     import derender
     from derender.features.embedding import unlike_training
 

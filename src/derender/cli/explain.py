@@ -4,9 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from derender.cli import options, scoring
-from derender.cli.console import notice, progress_bar, refuse_existing, report_images
+from derender.cli.console import notice, progress_bar, report_images
 from derender.cli.options import command, option
 from derender.storage.atomic import require_replaceable
+
+OUT = "Folder for page, chart, sheets of maps and probe."
+PAIR = "Also explain the distance of these two images."
 
 
 @dataclass(frozen=True)
@@ -22,28 +25,23 @@ class Asked:
     output: str = option("logit", "Attributed output: logit or probability.")
     baseline: str = option("zero", "Start of the path: zero (the paper's) or mean.")
     clusters: int | None = scoring.number(None, "Also explain the distance between N clusters.", min=2)
-    pair: tuple[str, str] | None = option(
-        None, "Also explain the distance of these two images.", metavar="FILE FILE"
-    )
+    pair: tuple[str, str] | None = option(None, PAIR, metavar="FILE FILE")
     batch_size: options.BatchSize = 256
     seed: options.Seed = 0
 
 
 @command("explain", "explain celeba.zip --model runs/faces --attributes --out why/")
 def explain(
-    model: options.TrainedModel, images: options.PartOfImages, published: scoring.Published,
-    asked: Asked,
+    model: options.TrainedModel, images: options.PartOfImages, published: scoring.Published, asked: Asked,
     label: list[str] | None = option(None, "Label column; several if each has two values.", "--label", "-l"),
     attributes: bool = option(False, "Every yes/no label.", "--attributes"),
-    out: Path | None = option(
-        None, "Folder for page, chart, sheets of maps and probe.", "--out", "-o", metavar="DIR"
-    ),
+    out: Path | None = option(None, OUT, "--out", "-o", metavar="DIR"),
     sheets: int = scoring.number(3, "Number of labels to draw maps for, best first.", min=0),
     rows: int = scoring.number(6, "Number of images on a sheet.", min=2),
 ) -> None:  # fmt: skip
     """Which factor made the answer, and where was it seen? Shares, maps, and controls for both."""
     if out is not None:
-        refuse_existing(out, published.force)
+        published.check(out, folder=True)
         require_replaceable(out, True, "explain.html")
     if bool(label) == attributes:
         raise ValueError("give either --label NAME (may be repeated) or --attributes")

@@ -41,9 +41,8 @@ def finetune(
         return
     memory = memory_in(cache)
     with run_progress() as how:
-        made = learn.finetune(
-            images.address, out=out, **images.how, device=device, memory=memory, **how, **vars(choices)
-        )
+        how |= {**images.how, "device": device, "memory": memory}
+        made = learn.finetune(images.address, out=out, **how, **vars(choices))
     report_run(made.run)
     published.result(f"model {made.run.folder}")
     published.result(f"report {out / 'report.html'}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from derender.cli.console import notice, refuse_existing
+from derender.cli.console import notice
 from derender.cli.options import OutModel, Output, Settings, command, option
 
 PRESETS = ("faces", "cats", "cars")
@@ -22,7 +22,7 @@ def import_checkpoint(
 
     With --set the ranges of its training are given where they differ, as translation_z=0.1 or fov_deg=10.
     """
-    refuse_existing(out, output.force)
+    output.check(out, folder=True)
     from derender.model import Derenderer
     from derender.networks.unsup3d import NETS
     from derender.presets import MODEL_PRESETS, named_preset
@@ -31,12 +31,10 @@ def import_checkpoint(
     ranges = named_preset(preset, {name: MODEL_PRESETS[name] for name in PRESETS}).ranges
     model = Derenderer.from_unsup3d(checkpoint, with_changes(ranges, settings or []))
     folder = model.save_pretrained(
-        out,
+        out, licence="that of the checkpoint", scores="No score was measured since it was imported.",
         data=f"the training set of {checkpoint.name}: a checkpoint of unsup3d, imported, not trained further",
-        licence="that of the checkpoint",
-        scores="No score was measured since it was imported.",
         overwrite=output.force,
-    )
+    )  # fmt: skip
     counts = {name: sum(value.numel() for value in model.nets[name].parameters()) for name in NETS.values()}
     notice(
         f"{model.image_size} x {model.image_size} pixels, {sum(counts.values()):,} parameters; measure how "

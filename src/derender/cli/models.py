@@ -1,6 +1,6 @@
 """`derender models` and `pack`: the models that are bundled, and one of your own in fewer bytes."""
 
-from derender.cli.console import notice, progress_bar, refuse_existing, result, write_json
+from derender.cli.console import notice, progress_bar, result, write_json
 from derender.cli.options import Json, OutModel, Output, PartOfImages, TrainedModel, command, option
 
 
@@ -29,7 +29,7 @@ def pack(
     from derender.inputs import as_model, copy_split
     from derender.storage.sharing import pack_model
 
-    refuse_existing(out, output.force)
+    output.check(out, folder=True)
     original, chosen = model.open(), None
     if images.optional_address is not None:
         chosen = images.read(original.image_size, model=model.model, at_least=2)

@@ -7,7 +7,7 @@ command that reads images is one field here, used in one method here.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from derender import learn
-from derender.cli.console import notice, progress_bar, refuse_existing, report_images, result, write_json
+from derender.cli.console import notice, progress_bar, report_images, result, write_json
 from derender.cli.runs import DryRun, dry_run_shown
 from derender.report.options import ImageOptions, option, single_suffix
 from derender.storage import places
@@ -24,8 +24,7 @@ from derender.storage import places
 if TYPE_CHECKING:
     from derender.data import ImageSet
     from derender.model import Derenderer
-    from derender.report.editing import Edited
-    from derender.report.opening import ImageOpener, OpenedImage
+    from derender.report.opening import ImageOpener
 
 BUNDLED = ", ".join(places.bundled_models())
 MODELS = f"Run folder, saved model, Hugging Face Hub id, or a bundled model: {BUNDLED}."
@@ -39,73 +38,74 @@ SEED = "Seed of every random choice: sampling, splits, initial weights."
 FIT = "Optimise each scene against its image by rendering, in N steps (20, say; slow)."
 OUT_IMAGES = "Folder to write to; or, of one image, a single .png, .jpg, .gif, .mp4 or .glb."
 SETTING = "Change one setting; may be repeated. The reference of settings lists all."
-Model = Annotated[str, typer.Option("--model", "-m", help=MODELS, metavar="MODEL")]
 Images = Annotated[str | None, typer.Argument(help=IMAGES, metavar="IMAGES", show_default=False)]
 Dataset = Annotated[str, typer.Option(help="Layout of the images, if it is not recognised.", metavar="NAME")]
 Json = Annotated[str | None, typer.Option("--json", help=JSON, metavar="FILE")]
 Limit = Annotated[int | None, typer.Option("--limit", min=1, metavar="N", help=LIMIT)]
 BatchSize = Annotated[int, typer.Option("--batch-size", min=1, metavar="N", help=BATCH)]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help=SEED)]
-Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.", metavar="DIR")]
-OutImages = Annotated[Path, typer.Option("--out", "-o", help=OUT_IMAGES, metavar="DIR|FILE")]
 OutModel = Annotated[Path, typer.Option("--out", "-o", help="Folder of the new model.", metavar="DIR")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, or auto.", metavar="NAME")]
 FitSteps = Annotated[int | None, typer.Option("--fit-steps", min=0, max=10_000, metavar="N", help=FIT)]
+Out = Path | str | None
 Settings = Annotated[list[str] | None, typer.Option("--set", help=SETTING, metavar="KEY=VALUE")]
+app = typer.Typer(
+    name="derender",
+    help="Decompose images into geometry, albedo, light and camera. Start with: derender demo",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 
 
-def command(name: str, example: str) -> Callable[[Callable[..., None]], Any]:
-    """Decorate a ``gathered`` command: it gets ``register``, which puts it under its name into an app."""
+def command(name: str, example: str, group: typer.Typer = app) -> Callable[[Callable[..., None]], Any]:
+    """Put a function into a group of commands, with the fields of its dataclass parameters in their place."""
 
     def decorated(function: Callable[..., None]) -> Callable[..., None]:
-        run: Any = gathered(function)
-        run.register = lambda app: app.command(name, epilog=f"Example: derender {example}")(run)
-        return run
+        kinds: dict[str, type] = {}
+        shown: list[Parameter] = []
+        for word, parameter in signature(function).parameters.items():
+            kind, options = parameter.annotation, [(word, parameter.annotation, parameter.default)]
+            if isinstance(kind, type) and is_dataclass(kind):
+                kinds[word], options = kind, [(one.name, one.type, one) for one in fields(kind)]
+            for key, type_, default in options:
+                if isinstance(default, Field):
+                    if words := dict(default.metadata):
+                        type_ = Annotated[type_, typer.Option(*words.pop("names"), **words)]
+                    default = Parameter.empty if default.default is MISSING else default.default
+                shown.append(Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=type_))
+
+        @functools.wraps(function)
+        def run(**given: Any) -> None:
+            groups = {}
+            for word, kind in kinds.items():
+                groups[word] = kind(**{one.name: given.pop(one.name) for one in fields(kind)})
+            function(**given, **groups)
+
+        run.__signature__ = Signature(shown)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+        return group.command(name, epilog=f"Example: derender {example}")(run)
 
     return decorated
-
-
-def gathered(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of its dataclass parameters in their place, all given by name."""
-    groups: dict[str, type] = {}
-    shown: list[Parameter] = []
-
-    def show(name: str, kind: Any, default: Any) -> None:
-        if isinstance(default, Field):
-            if words := dict(default.metadata):
-                kind = Annotated[kind, typer.Option(*words.pop("names"), **words)]
-            default = Parameter.empty if default.default is MISSING else default.default
-        shown.append(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind))
-
-    for name, parameter in signature(command).parameters.items():
-        kind = parameter.annotation
-        if isinstance(kind, type) and is_dataclass(kind):
-            groups[name] = kind
-            for field in fields(kind):
-                show(field.name, field.type, field)
-        else:
-            show(name, kind, parameter.default)
-
-    @functools.wraps(command)
-    def run(**given: Any) -> None:
-        taken = {
-            name: group(**{field.name: given.pop(field.name) for field in fields(group)})
-            for name, group in groups.items()
-        }
-        command(**given, **taken)
-
-    run.__signature__ = Signature(shown)  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
-    return run
 
 
 @dataclass(frozen=True)
 class Output:
     """Where numbers go, and whether existing files are replaced."""
 
-    force: Force = False
+    force: bool = option(False, "Replace existing output.", "--force")
     json_file: Json = None
+
+    def check(self, *files: Out, ends: Sequence[str] = (), folder: bool = False, force: bool = False) -> None:
+        """Refuse what exists, without ``force``; folders, unless one is meant; and files with other ends."""
+        for path in (Path(file) for file in files if file is not None and file != "-"):
+            if ends and path.suffix.lower() not in ends:
+                raise ValueError(f"--out {path} must end in {', '.join(ends)}: the kind of drawing")
+            if path.is_dir() and not folder:
+                raise IsADirectoryError(f"{path} is a folder: name a file to write")
+            if path.exists() and not (self.force or force):
+                raise FileExistsError(f"{path} exists already: choose another name, or add --force")
 
     def result(self, text: str) -> None:
         """Print one line of result."""
@@ -185,7 +185,7 @@ class PartOfImages(DataOptions):
 class TrainedModel:
     """The trained model of a command."""
 
-    model: Model
+    model: str = option(..., MODELS, "--model", "-m", metavar="MODEL")
     device: Device = "auto"
 
     def __post_init__(self) -> None:
@@ -204,7 +204,7 @@ class TrainedModel:
 class ImageModel(TrainedModel):
     """The trained model of a command for photographs."""
 
-    model: Model = "faces-64"
+    model: str = option("faces-64", MODELS, "--model", "-m", metavar="MODEL")
 
     def opener(self, how: ImageOptions, default_size: int = 0, **more: Any) -> "ImageOpener":
         """What opens images: the loaded model with the options."""
@@ -231,7 +231,7 @@ class Copying:
         if self.dry_run:
             dry_run_shown(learn.copy_settings(make.__name__, settings), output.json_file)
             raise typer.Exit
-        refuse_existing(out, output.force)
+        output.check(out, folder=True)
         with progress_bar(doing) as report:
             made = make(
                 model.model, images.address, out=out, settings=settings, seed=self.seed, device=model.device,
@@ -262,10 +262,8 @@ class GeneratedOptions:
 class ImageFiles:
     """Image files, and the folder for what is made of them."""
 
-    images: Annotated[
-        list[Path], typer.Argument(help="Image files, videos, or folders of them.", metavar="IMAGE...")
-    ]
-    out: OutImages
+    images: Annotated[list[Path], typer.Argument(help="Images, videos or their folders.", metavar="IMAGE...")]
+    out: Path = option(..., OUT_IMAGES, "--out", "-o", metavar="DIR|FILE")
     resume: bool = option(False, "Leave out images that are done.", "--resume")
 
     def __post_init__(self) -> None:
@@ -276,13 +274,8 @@ class ImageFiles:
         """Of ``--out`` where it names one file; else empty."""
         return single_suffix(self.out)
 
-    def edit(
-        self, opener: "ImageOpener", edit: "Callable[[OpenedImage], Edited]", output: ImageOutput, **how: Any
-    ) -> None:
-        """Edit, write and report every image; exit code 2 where one that was named cannot be read.
-
-        ``how`` are further keywords of ``write_images``.
-        """
+    def edit(self, opener: "ImageOpener", edit: Callable[..., Any], output: ImageOutput, **how: Any) -> None:
+        """Edit, write and report every image; exit code 2 where one that was named cannot be read."""
         from derender.report.editing import write_image_file, write_images
 
         write = write_image_file if self.suffix else write_images
@@ -291,9 +284,7 @@ class ImageFiles:
             try:
                 written = write(opener, self.images, self.out, edit, **how, progress=report)
             except KeyboardInterrupt:
-                raise KeyboardInterrupt(
-                    "stopped by Ctrl-C; finished images are kept: --resume continues"
-                ) from None
+                raise KeyboardInterrupt("stopped; finished images are kept: --resume continues") from None
         notice(*written.notes())
         output.result(f"{places.counted(len(written.images), 'images')} in {self.out}")
         output.write(written.values())

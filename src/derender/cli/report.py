@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from derender.cli import options
-from derender.cli.console import notice, progress_bar, refuse_existing_file
+from derender.cli.console import notice, progress_bar
 from derender.cli.options import Output, command, option
 
 Run = Annotated[Path, typer.Argument(help="Folder made by derender train.", metavar="RUN")]
@@ -28,8 +28,7 @@ def report(
 
     if not (run / "config.yaml").is_file():
         raise FileNotFoundError(f"no run in {run} (no config.yaml): give a folder made by derender train")
-    if out is not None:
-        refuse_existing_file(out, output.force)
+    output.check(out)
     evidence, data = Evidence(), images.optional_address
     if data is not None:
         how = {"truth": truth, "labels": label or (), "device": device, **images.how}

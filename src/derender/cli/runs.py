@@ -40,9 +40,8 @@ def run_progress() -> Iterator[dict[str, Any]]:
 
     def show(progress: "Progress") -> None:
         speed = f"{progress.images_per_second:.0f} images/s, {progress.waiting:.1%} waiting for data"
-        speed = speed if progress.phase == "train" else ""
-        description, unit = PHASES[progress.phase]
-        report(progress.done, progress.total, speed, description=description, unit=unit)
+        (description, unit), trains = PHASES[progress.phase], progress.phase == "train"
+        report(progress.done, progress.total, speed if trains else "", description=description, unit=unit)
 
     from derender.data.doctor import quick_verdict
 

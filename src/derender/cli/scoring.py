@@ -6,17 +6,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from typer import Option
+from typer import Option, Typer
 
 from derender.cli import options
-from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores
+from derender.cli.console import notice, progress_bar, show_scores
 from derender.cli.options import option
+from derender.storage.atomic import write_whole
 
 if TYPE_CHECKING:
     from derender.evaluation.score_table import Scores
 
-number = partial(option, min=1, metavar="N")
-"""An option that takes a whole number, 1 or more."""
+evaluate = Typer(help="Score features or a model, beside controls.", no_args_is_help=True)
+options.app.add_typer(evaluate, name="evaluate")
+
+number = partial(option, min=1, metavar="N")  # a whole number, 1 or more
 share = partial(option, min=0.01, max=0.99)
 target = partial(option, None, metavar="FILE")
 
@@ -59,12 +62,11 @@ class ScoredSubject:
         how |= {"images": images.optional_address, **images.how, "factors": names_of(self.factors)}
         if (self.features is None) == (self.model is None):
             raise ValueError("give either --features FILE, or --model M with IMAGES")
-        source: Any = self.model
-        if source is None:
-            source = half_of(FeatureTable.read(str(self.features)), images.half)
-        elif images.optional_address is None:
+        if self.model is not None and images.optional_address is None:
             raise ValueError("--model needs IMAGES to embed")
-        published.publish(measured(protocol, source, **how), half=images.half)
+        table, half = self.features, images.half
+        source = self.model if table is None else half_of(FeatureTable.read(table), half)
+        published.publish(measured(protocol, source, **how), half=half)
 
 
 @dataclass(frozen=True)
@@ -87,21 +89,11 @@ class Published(options.Output):
 
     def __post_init__(self) -> None:
         """Refuse, before anything is computed, to write over tables, and into folders."""
-        for file in (self.markdown, self.latex, self.html, self.json_file):
-            if file not in (None, "-"):
-                refuse_existing_file(Path(file), self.force or file == self.json_file)
-
-    def check_drawing(self, out: Path | None, forms: Sequence[str]) -> None:
-        """Refuse to write over a drawing, and to draw in another form."""
-        if out is not None:
-            if out.suffix.lower() not in forms:
-                raise ValueError(f"--out {out} must end in {', '.join(forms)}: the kind of drawing")
-            refuse_existing_file(out, self.force)
+        self.check(self.markdown, self.latex, self.html)
+        self.check(self.json_file, force=True)
 
     def publish(self, scores: "Scores", **values: Any) -> None:
         """Show tables and notes, and write every form that was requested; ``values`` are further numbers."""
-        from derender.storage.atomic import write_whole
-
         values, notes, tables = {**scores.values, **values}, list(scores.notes), scores.tables
         if (half := values.get("half", "all")) != "all":
             tables = [replace(one, caption=f"{one.caption}; {half} half") for one in tables]

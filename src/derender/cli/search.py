@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from derender.cli import options
-from derender.cli.console import notice, progress_bar, refuse_existing_file, show_scores
+from derender.cli.console import notice, progress_bar, show_scores
 from derender.cli.options import command, option
 
 LABELS_SHOWN = 4
@@ -24,10 +24,7 @@ def search(
     dataset: options.Dataset = "auto", device: options.Device = "auto",
 ) -> None:  # fmt: skip
     """Find the same geometry under any lighting, the same lighting on anything: nearest by one factor."""
-    if out is not None:
-        refuse_existing_file(out, output.force)
-        if out.suffix.lower() != ".png":
-            raise ValueError(f"{out} is no PNG: give --out a name that ends in .png")
+    output.check(out, ends=[".png"])
     import derender
     from derender.evaluation.score_table import Column, Row, ScoreTable
 

@@ -5,8 +5,12 @@ from typing import Any
 from typer import Typer
 
 from derender.cli.console import progress_bar, result, write_json
-from derender.cli.options import GeneratedOptions, command, option
+from derender.cli.options import GeneratedOptions, app, command, option
 from derender.storage.places import counted
+
+CLASSES = "Only these classes; default: all twelve."
+group = Typer(help="Generate images of known geometry, albedo, light and camera.", no_args_is_help=True)
+app.add_typer(group, name="synth")
 
 
 def generate(
@@ -36,7 +40,7 @@ def generate(
     write_json(file, {"out": request.out, **facts, "settings": settings.model_dump(mode="json")})
 
 
-@command("faces", "synth faces --out made/ --count 500 --light wide")
+@command("faces", "synth faces --out made/ --count 500 --light wide", group)
 def faces(
     request: GeneratedOptions,
     identities: int | None = option(None, "Number of people; default: 8 images each.", min=1),
@@ -55,18 +59,8 @@ def faces(
     generate(request, "faces", count, "identities", names, model, **own)
 
 
-@command("cars", "synth cars --out made/ --classes police,jeep")
-def cars(
-    request: GeneratedOptions,
-    classes: str = option("", "Only these classes; default: all twelve.", metavar="A,B"),
-) -> None:
+@command("cars", "synth cars --out made/ --classes police,jeep", group)
+def cars(request: GeneratedOptions, classes: str = option("", CLASSES, metavar="A,B")) -> None:
     """Generate cars of twelve classes with ground truth; the folder reads back as the layout syncar."""
     names = [f"classes=[{classes}]"] if classes else []
     generate(request, "cars", request.count or 1000, "models", names)
-
-
-def register(app: Typer) -> None:
-    group = Typer(help="Generate images of known geometry, albedo, light and camera.", no_args_is_help=True)
-    for kind in (faces, cars):
-        kind.register(group)
-    app.add_typer(group, name="synth")

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Literal
 
 from derender.cli import options, scoring
-from derender.cli.options import option
+from derender.cli.options import command, option
 
+MODEL = "A model; the first renders."
 PICTURES = "faces or cars: generated. render: IMAGES, re-rendered. truth: IMAGES of known angles."
 
 
@@ -25,12 +26,11 @@ class TrialOptions:
     untrained_seeds: scoring.UntrainedSeeds = 5
 
 
+@command("robustness", "evaluate robustness --model runs/faces --out curves.svg", scoring.evaluate)
 def robustness(
     images: options.DataOptions, trial: TrialOptions, labels: scoring.Labels, computed: scoring.Computed,
     published: scoring.Published, factors: scoring.Factors = "geometry,albedo",
-    model: list[str] = option(
-        ..., "A model; the first renders.", "--model", "-m", metavar="[NAME=]MODEL"
-    ),
+    model: list[str] = option(..., MODEL, "--model", "-m", metavar="[NAME=]MODEL"),
     axes: str = option("yaw,light", "yaw, pitch, light, light-pitch; with commas."),
     angles: str = option("0,15,30,45,60,75", "Growing degrees off the front."),
     score: Literal["accuracy", "balanced"] = option("accuracy", "The score shown; --json has both."),
@@ -41,7 +41,7 @@ def robustness(
     Images are generated, so that light and view are known; or IMAGES are re-rendered by the first model; or
     IMAGES have known angles.
     """
-    published.check_drawing(out, [".svg", ".png"])
+    published.check(out, ends=[".svg", ".png"])
     shown = "balanced_accuracy" if score == "balanced" else score
     models = scoring.named_paths(model, "--model")
     if twice := [name for name, paths in models.items() if len(paths) > 1]:

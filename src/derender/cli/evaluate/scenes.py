@@ -1,18 +1,39 @@
 """`derender evaluate geometry` and `reconstruction`: is the geometry true, and the image rendered well?"""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 from derender.cli import options, scoring
 from derender.cli.console import notice
-from derender.cli.options import option
+from derender.cli.options import DataOptions, command, option
+from derender.cli.scoring import Published
 
 STORE = "Store the errors with the model, to detect out-of-distribution images: use unseen images."
 
 
+@dataclass(frozen=True)
+class Decomposed(options.TrainedModel):
+    """The model that decomposes, and how its scenes are scored."""
+
+    fit_steps: options.FitSteps = None
+    resamples: scoring.Resamples = 1_000
+    seed: options.Seed = 0
+
+    @property
+    def how(self) -> dict[str, int | None]:
+        """Keywords of the protocols."""
+        return {"fit_steps": self.fit_steps, "resamples": self.resamples, "seed": self.seed}
+
+    def score(self, protocol: str, images: DataOptions, published: Published, **own: Any) -> None:
+        """Score by a protocol of `derender.evaluation`, and publish."""
+        how: dict[str, Any] = {**self.how, **images.how, **own, "doing": "decomposing"}
+        published.publish(scoring.measured(protocol, self.open(), images.address, **how), half=images.half)
+
+
+@command("geometry", "evaluate geometry made/::test_gt --model runs/faces", scoring.evaluate)
 def geometry(
-    images: options.DataOptions, trained: options.TrainedModel, published: scoring.Published,
-    batch_size: options.BatchSize = 64, fit_steps: options.FitSteps = None,
-    resamples: scoring.Resamples = 1_000, seed: options.Seed = 0, cache: scoring.Cache = None,
+    images: DataOptions, model: Decomposed, published: Published,
+    batch_size: options.BatchSize = 64, cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Is the geometry the true one? SIDE and MAD on rendered images with exact depth, beside controls.
 
@@ -20,18 +41,14 @@ def geometry(
     """
     if images.dataset != "auto":
         raise ValueError("sets with depth are recognised by themselves: leave --dataset out")
-    scores = scoring.measured(
-        "geometry", trained.open(), images.address, limit=images.limit, fit_steps=fit_steps, seed=seed,
-        resamples=resamples, batch_size=batch_size, cache=cache, doing="decomposing",
-    )  # fmt: skip
-    published.publish(scores)
+    model.score("geometry", images, published, batch_size=batch_size, cache=cache)
 
 
+@command("reconstruction", "evaluate reconstruction photos/ --model runs/faces --part test", scoring.evaluate)
 def reconstruction(
-    images: options.PartOfImages, trained: options.TrainedModel, published: scoring.Published,
-    batch_size: options.BatchSize = 64, fit_steps: options.FitSteps = None,
+    images: options.PartOfImages, model: Decomposed, published: Published,
+    batch_size: options.BatchSize = 64, cache: scoring.Cache = None,
     store: bool = option(False, STORE, "--store"),
-    resamples: scoring.Resamples = 1_000, seed: options.Seed = 0, cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """How well are images reconstructed? L1, PSNR and SSIM inside the mask, beside controls.
 
@@ -41,15 +58,15 @@ def reconstruction(
     from derender.storage.places import model_folder
     from derender.training.held_out_errors import errors_of, write_errors
 
-    model = trained.open()
-    known = replace(images, part="all").read(model.image_size)
-    chosen = part_of(known, images.part, trained.model)
-    learned = known if images.part == "all" else part_of(known, "train", trained.model)
+    loaded = model.open()
+    known = replace(images, part="all").read(loaded.image_size)
+    chosen = part_of(known, images.part, model.model)
+    learned = known if images.part == "all" else part_of(known, "train", model.model)
     scores = scoring.measured(
-        "reconstruction", model, chosen, training_images=learned, fit_steps=fit_steps,
-        resamples=resamples, seed=seed, batch_size=batch_size, cache=cache, doing="rendering",
+        "reconstruction", loaded, chosen, training_images=learned, **model.how, batch_size=batch_size,
+        cache=cache, doing="rendering",
     )  # fmt: skip
     published.publish(scores, part=images.part)
     if store:
-        file = write_errors(model_folder(trained.model), errors_of(model, chosen.images, batch_size))
+        file = write_errors(model_folder(model.model), errors_of(loaded, chosen.images, batch_size))
         notice(f"errors of {len(chosen):,} images stored in {file}")

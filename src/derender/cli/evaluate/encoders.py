@@ -1,13 +1,16 @@
-"""`derender evaluate segment`: do pre-trained encoders help to find the parts of a face?"""
+"""`derender evaluate segment` and `disentangle`: do encoders help, and do features hold one factor each?"""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from derender.cli import options, scoring
-from derender.cli.options import option
+from derender.cli.options import command, option
 
 OUT = "Folder for runs (to continue) and overlays."
 
 
+@command("segment", "evaluate segment CelebAMask-HQ/ --model runs/unet --out segmented/", scoring.evaluate)
 def segment(
     images: options.DataOptions, trained: options.TrainedModel, published: scoring.Published,
     masks: scoring.Masks = None,
@@ -39,3 +42,36 @@ def segment(
 
         published.result(f"overlays {write_overlays(scores.result, out)}")
     published.publish(scores, model=trained.model)
+
+
+@dataclass(frozen=True)
+class CardImages(options.PartOfImages):
+    """The images of the card."""
+
+    limit: options.Limit = 2000
+
+
+@command("disentangle", "evaluate disentangle made/ --model runs/faces --out card.png", scoring.evaluate)
+def disentangle(
+    images: CardImages, trained: options.TrainedModel, published: scoring.Published,
+    out: Path | None = option(None, "PNG file for all matrices.", "--out", "-o", metavar="FILE.png"),
+    seeds: int = scoring.number(3, "Number of seeds.", max=20),
+    swap_pictures: int = scoring.number(256, "Most images in the swap test.", min=2),
+    dimensions: Literal["lasso", "none"] = option("lasso", "Scores by dimension: lasso or none."),
+    batch_size: options.BatchSize = 64, seed: options.Seed = 0, cache: scoring.Cache = None,
+) -> None:  # fmt: skip
+    """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
+    published.check(out, ends=[".png"])
+    model = trained.open()
+    chosen = images.read(model.image_size, model=trained.model)
+    scores = scoring.measured(
+        "disentangle", model, chosen, seeds=range(seed, seed + seeds), swap_images=swap_pictures,
+        dimensions=None if dimensions == "none" else dimensions, batch_size=batch_size, cache=cache,
+        unit="steps",
+    )  # fmt: skip
+    if out is not None:
+        from derender.report.charts import write_card
+
+        write_card(scores.result, f"{trained.model}: {len(chosen):,} images", out)
+        published.result(f"matrices in {out}")
+    published.publish(scores)
