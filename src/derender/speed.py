@@ -7,10 +7,11 @@ installed with derender: those are in benchmarks/.
 
 import tempfile
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from timeit import timeit
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +29,8 @@ from derender.training.run_folder import environment
 from derender.training.step import training_step
 
 
-class SpeedPair(NamedTuple):
+@dataclass(frozen=True)
+class SpeedPair:
     """Ours against theirs: what is compared, how many of which unit each call does, and the two calls."""
 
     what: str

@@ -29,7 +29,7 @@ __all__ = [
     "search", "table_labels", "unlike_training",
 ]  # fmt: skip
 
-_HOME = dict.fromkeys(("Embedded", "embed", "embed_to_file", "unlike_training"), "embedding")
+_HOME: dict[str, str] = dict.fromkeys(("Embedded", "embed", "embed_to_file", "unlike_training"), "embedding")
 _HOME |= {"search": "neighbours", "DisentangledFeatures": "transformer"}
 
 

@@ -20,7 +20,7 @@ class Decomposed(options.TrainedModel):
     seed: options.Seed = 0
 
     @property
-    def how(self) -> dict[str, int | None]:
+    def how(self) -> dict[str, Any]:
         """Keywords of the protocols."""
         return {"fit_steps": self.fit_steps, "resamples": self.resamples, "seed": self.seed}
 
