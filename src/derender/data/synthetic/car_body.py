@@ -30,8 +30,7 @@ ARCH = 1.13  # radius of the wheel arches in wheel radii
 BED_FROM, BED_TO, BED_SIDE = 6.12, 6.93, 0.86
 Colour = tuple[float, float, float]
 Decal = tuple[float, ...]  # the columns of one shape, as in mesh_image
-Places = Mapping[str, float]
-"""Lengths by name, as ``cars.yaml`` uses them."""
+Places = Mapping[str, float]  # lengths by name, as ``cars.yaml`` uses them
 _LAST = 9  # station
 _ROWS_BETWEEN = (4, 6, 9, 10, 8, 10, 9, 6, 4)  # rows from each station to the next
 _ACROSS = np.array([0.0, 0.22, 0.44, 0.62, 0.76, BED_SIDE, BED_SIDE + 0.02, 0.93, 0.97, 1.0])
@@ -40,6 +39,7 @@ _SIDE = np.array([0.05, 0.13, 0.26, 0.4, 0.55, 0.7, 0.85, 1.0])
 _ROUND = np.array([0.42, 0.32, 0.16, 0.26, 0.26, 0.16, 0.28, 0.42])  # stations, most of each inner corner
 _DOWN, _FLIP = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 _TURN = np.linspace(0.0, 2.0 * np.pi, 25)
+_RIM = np.array([-1.0, -0.5, 0.5, 1.0])  # of a box's face: 1 is its rounded rim, 0.5 its flat inside
 
 
 class CarShape(NamedTuple):
@@ -74,8 +74,7 @@ class CarShape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What is on one chart: colour and part where no shape lies, shapes (later ones on top), holes as in
-    Paint."""
+    """One chart: colour and part where no shape lies, shapes (later ones on top), holes as in Paint."""
 
     colour: Colour
     part: str = "trim"
@@ -145,7 +144,10 @@ def rounded_box(
 
     ``surfaces`` are those of top (chart x, z), front and rear (x, y) and sides (z, y).
     """
-    rim, edge = _box_faces(), min(radius, *half)
+    row, column = np.meshgrid(-_RIM, _RIM, indexing="ij")  # rows run down or forwards, columns to the right
+    one, edge = np.ones_like(row), min(radius, *half)
+    sides = [(column, one, row), (column, row, -one), (-column, row, one), (one, row, column)]
+    rim = np.moveaxis(np.array([*sides, (-one, row, -column)]), 1, -1)  # with the sign of the side
     flat, outward = np.sign(rim) * (np.asarray(half, float) - edge), unit(np.trunc(rim))
     cos, sin = np.cos(lean_rad), np.sin(lean_rad)
     turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
@@ -154,16 +156,6 @@ def rounded_box(
     top, front, rear, side = surfaces
     faces = ((top, [0, 2]), (front, [0, 1]), (rear, [0, 1]), (side, [2, 1]), (side, [2, 1]))
     return [Grid(points[i], normals[i], points[i][..., axes], s) for i, (s, axes) in enumerate(faces)]
-
-
-def _box_faces() -> ndarray:
-    """(5, 4, 4, 3), top, front, rear, right, left: 1 marks the rounded rim of a face, 0.5 its flat inside,
-    with the sign of the side."""
-    a = np.array([-1.0, -0.5, 0.5, 1.0])
-    row, column = np.meshgrid(-a, a, indexing="ij")  # rows run down or forwards, columns to the right
-    one = np.ones_like(row)
-    faces = [(column, one, row), (column, row, -one), (-column, row, one), (one, row, column)]
-    return np.moveaxis(np.array([*faces, (-one, row, -column)]), 1, -1)
 
 
 def wheel(
@@ -229,12 +221,12 @@ def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
     """The body's lines at these stations (0..9): linear interpolation of rows whose corners are parabolas,
     lifted above the wheels of low cars, so that an arch fits below."""
     table, corners = _table(shape), _ROUND * (0.12 + 0.88 * shape.soft)
-    low = np.minimum(stations.astype(int), _LAST - 1)
+    low, from_ends = np.minimum(stations.astype(int), _LAST - 1), np.minimum(stations, _LAST - stations)
     slope = np.diff(table, axis=0)
     inside = np.maximum(0.0, corners - np.abs(stations[:, None] - np.arange(1, _LAST)))
     rows = table[low] + slope[low] * (stations - low)[:, None]
     rows += inside**2 / (4.0 * corners) @ np.diff(slope, axis=0)
-    shoulder = np.clip((_from_ends(stations) - 1.3) / 0.6, 0.0, 1.0) * (1.0 - _cabin(stations))
+    shoulder = np.clip((from_ends - 1.3) / 0.6, 0.0, 1.0) * (1.0 - _cabin(stations))
     for wheel_at in (shape.front_wheel, shape.rear_wheel):
         lack = (1.0 + ARCH) * shape.wheel + 0.07 - rows[:, 7]
         near = np.exp(-(((rows[:, 8] - wheel_at) / 0.45) ** 2))
@@ -289,18 +281,13 @@ def _half(s: CarShape, stations: ndarray) -> Float[ndarray, "t c 3"]:
     glass = (1 - f) ** 2 * edge[:, None] + 2 * f * (1 - f) * control + f**2 * waist[:, None]
     down = waist[:, None] + _SIDE[:, None] * (lines.sill - waist)[:, None]
     down[..., 0] += 0.035 * (1.0 - np.exp(-_SIDE / 0.06)) * cabin[:, None]
-    from_ends = np.clip(_from_ends(stations) - 0.4, 0.0, 1.0)[:, None]
+    from_ends = np.clip(np.minimum(stations, _LAST - stations) - 0.4, 0.0, 1.0)[:, None]
     down[..., 0] += 0.05 * np.sin(np.pi * _SIDE) * (1.0 - _SIDE) * from_ends
     for wheel_at in (s.front_wheel, s.rear_wheel):
         away = np.hypot(down[..., 2] - wheel_at, down[..., 1] - s.wheel)
         stands_out = np.exp(-(((away - 1.2 * s.wheel) / 0.16) ** 2)) + 0.6 * np.exp(-((away / 0.7) ** 2))
         down[..., 0] += s.flare * stands_out * from_ends * np.clip((down[..., 1] - s.sill) / 0.25, 0.0, 1.0)
     return np.concatenate([top, glass, down], axis=1)
-
-
-def _from_ends(stations: ndarray) -> ndarray:
-    """Stations from the nearer end of the outline."""
-    return np.minimum(stations, _LAST - stations)
 
 
 def _cabin(stations: ndarray) -> ndarray:

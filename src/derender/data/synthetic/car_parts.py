@@ -7,41 +7,20 @@ and a cross or a six-pointed star. None is that of an existing service. Leaves o
 and lettering that can be read.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from derender.data.synthetic.car_body import (
-    ARCH,
-    BED_FROM,
-    BED_TO,
-    PARTS,
-    BodyLines,
-    CarShape,
-    Colour,
-    Decal,
-    Grid,
-    Places,
-    Surface,
-    body_lines,
-    body_pieces,
-    both,
-    half_width,
-    join,
-    metres,
-    rounded_box,
-    wheel,
-    wheel_house,
-)
+from derender.data.synthetic import car_body as body
+from derender.data.synthetic.car_body import CarShape, Colour, Decal, Grid, Places, Surface, both, metres
 from derender.data.synthetic.decals import BOX, DECAL_LENGTH, ELLIPSE, MOST_CORNERS
 from derender.data.synthetic.mesh_image import TriangleMesh
 from derender.data.synthetic.settings import drawn, numbers_of
 
-Finish = tuple[float, ...]
-"""Columns of a shape: whether its colour multiplies that below, its part or -1, its colour."""
+Finish = tuple[float, ...]  # columns of a shape: if its colour multiplies that below, part or -1, colour
 Lengths = Sequence[str | float]
 
 
@@ -78,8 +57,8 @@ class CarTraits:
         """Its measures, and the lengths that chance, the body's lines and ``cars.yaml`` derive, by name."""
         tables, s = numbers_of("cars"), self.shape
         places = {**s._asdict(), "spokes": float(self.spokes)}
-        rails, bed = (body_lines(s, np.array(at)) for at in ([4.1, 4.5, 4.9], [BED_FROM, BED_TO]))
-        edge = rails.edge
+        edge = body.body_lines(s, np.array([4.1, 4.5, 4.9])).edge  # where rails lie
+        bed = body.body_lines(s, np.array([body.BED_FROM, body.BED_TO]))
         for name, (at, *ends) in tables["drawn"].items():
             places[name] = drawn((ends[0], ends[1]), self.chances[at])
         places["bed_from"], places["bed_to"] = bed.middle[:, 2].tolist()
@@ -96,15 +75,14 @@ class CarTraits:
 
     def finish(self, colour: str | float, part: str = "") -> Finish:
         """A colour and a part, by their names or by what ``cars.yaml`` has the car choose by."""
-        number = PARTS.index(self.chosen(part)) if part else -1
+        number = body.PARTS.index(self.chosen(part)) if part else -1
         if not isinstance(colour, str):
             return (True, number, colour, colour, colour)
         return (False, number, *self.colour(colour))
 
     def colour(self, name: str) -> Colour:
         """A colour of the car's own or of ``cars.yaml``, by its name."""
-        name = self.chosen(name)
-        fixed = numbers_of("cars")["colours"]
+        name, fixed = self.chosen(name), numbers_of("cars")["colours"]
         return tuple(fixed[name]) if name in fixed else getattr(self, name)
 
     def chosen(self, name: str) -> str:
@@ -119,23 +97,23 @@ def build_car(car: CarTraits) -> TriangleMesh:
     """Mesh in metres (x right, y down, z to the rear; ground at y = 0) with its paint."""
     s, jeep, black = car.shape, car.name == "jeep", Surface(car.colour("black"))
     wheels = (s.front_wheel, s.rear_wheel)
-    holes = [(at, s.wheel, 0.0 if jeep else ARCH * s.wheel) for at in wheels]
+    holes = [(at, s.wheel, 0.0 if jeep else body.ARCH * s.wheel) for at in wheels]
     side = Surface(car.paint, "body", side_paint(car), holes=holes)
-    pieces, flank = body_pieces(s, Surface(car.paint, "body", shapes("top", car)), side)
+    pieces, flank = body.body_pieces(s, Surface(car.paint, "body", shapes("top", car)), side)
     tyre = Surface(car.colour("tyre"), "wheel", shapes("wheel", car))
-    template = wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
+    wheel = body.wheel((0, s.wheel, 0), s.wheel, 0.28 if jeep else 0.24, tyre)
     for at in wheels:
         out, houses = s.width / 2 + 0.15, []
         if not jeep:
             z, y = np.meshgrid([-1.1, 0.0, 1.1], [0.8, 1.2])
-            out = half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
-            houses = [wheel_house(out - 0.25, at, s, flank, black)]
-        pieces += both([template._replace(points=template.points + np.array((out, 0.0, at))), *houses])
+            out = body.half_width(flank, at + z * s.wheel, y * s.wheel).min() - 0.025
+            houses = [body.wheel_house(out - 0.25, at, s, flank, black)]
+        pieces += both([wheel._replace(points=wheel.points + np.array((out, 0.0, at))), *houses])
     beside = s.cowl_at + (0.1 if car.has(["upright"]) else 0.28)
-    places = {**car.places, "mirror": half_width(flank, beside, s.cowl - 0.05) + 0.09}
+    places = {**car.places, "mirror": body.half_width(flank, beside, s.cowl - 0.05) + 0.09}
     for row in numbers_of("cars")["fittings"]:
         pieces += fitting(car, places, *row)
-    return join([*pieces, *([_spare_wheel(car)] if jeep else [])])
+    return body.join([*pieces, *([_spare_wheel(car)] if jeep else [])])
 
 
 def _spare_wheel(car: CarTraits) -> Grid:
@@ -143,8 +121,8 @@ def _spare_wheel(car: CarTraits) -> Grid:
     s = car.shape
     spare = Surface(car.colour("tyre"), "wheel", shapes("wheel", car) + shapes("spare", car))
     if car.has(["open"]) or not car.has(["spare on bonnet"]):
-        return wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True)
-    lying = wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
+        return body.wheel((0, s.cowl - 0.08, s.length + 0.24), s.wheel * 0.95, 0.24, spare, backwards=True)
+    lying = body.wheel((0, 0, 0), s.wheel * 0.92, 0.22, spare, backwards=True)
     middle = (0, 0.5 * (s.nose + s.cowl) + 0.16, 0.55 * (s.nose_at + s.cowl_at))
     points = (lying.points - lying.points[0, 0])[..., [0, 2, 1]] * (1.0, 1.0, -1.0) + middle
     return lying._replace(points=points, normals=lying.normals[..., [0, 2, 1]] * (1.0, -1.0, 1.0))
@@ -153,32 +131,25 @@ def _spare_wheel(car: CarTraits) -> Grid:
 def shapes(chart: str, car: CarTraits, **more: float) -> list[Decal]:
     """The shapes of ``cars.yaml`` on a chart, none of ""; ``more`` are places beside the car's own."""
     places, rows = {**car.places, **more}, numbers_of("cars")["shapes"][chart] if chart else ()
-    return [
-        decal
-        for kind, colour, part, numbers, *conditions in rows
-        if car.has(conditions)
-        for decal in SHAPES[kind](car.finish(colour, part), *(metres(one, places) for one in _flat(numbers)))
-    ]
-
-
-def _flat(numbers: Sequence[Any]) -> Iterator[str | float]:
-    for number in numbers:
-        yield from number if isinstance(number, list) else [number]
+    decals = []
+    for kind, colour, part, numbers, *conditions in rows:
+        if car.has(conditions):
+            flat = (one for some in numbers for one in (some if isinstance(some, list) else [some]))
+            decals += SHAPES[kind](car.finish(colour, part), *(metres(one, places) for one in flat))
+    return decals
 
 
 def fitting(
     car: CarTraits, places: Places, centre: Lengths, half: Lengths, radius: float, colour: str, part: str,
-    conditions: Sequence[str], lean_rad: float = 0.0, charts: str | Sequence[str] = "",
+    conditions: Sequence[str], lean_rad: float = 0.0, charts: Sequence[str] = ("",) * 4,
 ) -> list[Grid]:  # fmt: skip
     """The rounded box of a row of ``cars.yaml``, on both sides where it is not in the middle; nothing where
     the row does not hold."""
     if not car.has(conditions):
         return []
-    finish = car.colour(colour), car.chosen(part)
-    of_faces = [charts] * 4 if isinstance(charts, str) else charts
-    surfaces = [Surface(*finish, shapes(chart, car)) for chart in of_faces]
+    surfaces = [Surface(car.colour(colour), car.chosen(part), shapes(chart, car)) for chart in charts]
     at, sides = ([metres(one, places) for one in row] for row in (centre, half))
-    pieces = rounded_box(at, sides, radius, surfaces, lean_rad)
+    pieces = body.rounded_box(at, sides, radius, surfaces, lean_rad)
     return both(pieces) if at[0] else pieces
 
 
@@ -187,19 +158,18 @@ def _decal(kind: int, finish: Finish, bounds: Sequence[float], *own: float) -> D
     return numbers + (0.0,) * (DECAL_LENGTH - len(numbers))
 
 
-def polygon(finish: Finish, *corners: float) -> list[Decal]:
+def polygon(finish: Finish, *corners: Any) -> list[Decal]:
     """Of three to nine corners, each along both coordinates of the chart, in any direction."""
-    u, v = corners[::2], corners[1::2]
+    numbers = np.ravel(corners).tolist()
+    u, v = numbers[::2], numbers[1::2]
     assert 3 <= len(u) <= MOST_CORNERS, len(u)
-    return [_decal(len(u), finish, (min(u), min(v), max(u), max(v)), *corners)]
+    return [_decal(len(u), finish, (min(u), min(v), max(u), max(v)), *numbers)]
 
 
 def inside(finish: Finish, u: float, v: float, *corners: float) -> list[Decal]:
     """A polygon that is smaller than one with these corners, about (u, v): the glass of a lamp."""
     middle = np.array([u, v])
-    return polygon(
-        finish, *(middle + (0.86, 0.76) * (np.reshape(corners, (-1, 2)) - middle)).ravel().tolist()
-    )
+    return polygon(finish, middle + (0.86, 0.76) * (np.reshape(corners, (-1, 2)) - middle))
 
 
 def box(finish: Finish, u0: float, v0: float, u1: float, v1: float) -> list[Decal]:
@@ -252,7 +222,7 @@ def star(finish: Finish, u: float, v: float, across: float, along: float) -> lis
         up = np.array([across * np.sin(turn), along * np.cos(turn)])
         side = 0.17 * np.array([across * np.cos(turn), -along * np.sin(turn)])
         arm = np.array([up + side, up - side, -up - side, side - up])
-        decals += polygon(finish, *(arm + np.array([u, v])).ravel().tolist())
+        decals += polygon(finish, arm + np.array([u, v]))
     return decals
 
 
@@ -263,7 +233,7 @@ SHAPES: Mapping[str, Callable[..., list[Decal]]] = {
 
 def side_paint(car: CarTraits) -> list[Decal]:
     """Shapes on both sides."""
-    lines, doors = body_lines(car.shape, np.linspace(0.0, 9.0, 181)), _door_edges(car)
+    lines, doors = body.body_lines(car.shape, np.linspace(0.0, 9.0, 181)), _door_edges(car)
     edges = dict(zip(("doors_from", "post", "rear_post"), doors[:-1], strict=False), doors_to=doors[-1])
     nearest = {name: np.argmin(np.abs(lines.waist[:, 2] - at)) for name, at in edges.items()}
     places = edges | {f"{name}_waist": float(lines.waist[row, 1]) for name, row in nearest.items()}
@@ -286,15 +256,14 @@ def _door_edges(car: CarTraits) -> list[float]:
     return [first, 0.5 * (first + last) + 0.02, last]
 
 
-def _windows(car: CarTraits, lines: BodyLines, doors: list[float]) -> list[Decal]:
+def _windows(car: CarTraits, lines: body.BodyLines, doors: list[float]) -> list[Decal]:
     waist, edge = (side[:, 2:0:-1] for side in (lines.waist, lines.edge))
     corners = np.concatenate([
         waist[[70, 84, 100, 110]] + (0.0, 0.035), edge[[105, 98, 88, 79, 72]] - (0.0, 0.05),
     ])  # fmt: skip
     corners[[4, 7, 8]] += [(-0.06, 0.0), (0.05, 0.0), (0.09, 0.03)]
     outline = corners + 0.035 * np.sign(corners - corners.mean(axis=0))
-    decals = polygon(car.finish("outline", "trim"), *outline.ravel().tolist())
-    decals += polygon(car.finish("glass", "window"), *corners.ravel().tolist())
+    decals = polygon(car.finish("outline", "trim"), outline) + polygon(car.finish("glass", "window"), corners)
     if car.has(["panel", "blind"]):  # a panel instead of windows
         right, top = outline.max(axis=0).tolist()
         return decals + box(car.finish("paint", "body"), doors[-1], float(outline[0, 1]), right, top)

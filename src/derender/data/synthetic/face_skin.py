@@ -15,23 +15,9 @@ from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
 from derender.data import MASK_CLASSES
+from derender.data.synthetic import face_shape as head
 from derender.data.synthetic.face_identity import SKIN_FIELDS, Identity, draw_identity, identity_columns
-from derender.data.synthetic.face_shape import (
-    ACTIONS,
-    EYE_P,
-    EYE_Q,
-    MOUTH_BAND,
-    MOUTH_Q,
-    Expression,
-    FaceGrid,
-    FaceShape,
-    age_lines,
-    ear_angle,
-    face_shape,
-    gauss,
-    hill,
-    smoothstep,
-)
+from derender.data.synthetic.face_shape import FaceGrid, FaceShape, gauss, hill, smoothstep
 from derender.data.synthetic.mesh_image import TriangleMesh, grid_triangles
 from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshOf
 from derender.data.synthetic.settings import FaceSettings, numbers_of
@@ -79,18 +65,18 @@ class Skin(NamedTuple):
 @lru_cache(maxsize=4)
 def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
     """Fixed fields over the domain, between 0 and 1 or zero-mean, and the parts that never move."""
-    grid, generator = face_shape(detail).grid, np.random.default_rng(_FIELD_SEED)
+    grid, generator = head.face_shape(detail).grid, np.random.default_rng(_FIELD_SEED)
     p, q, bump = np.abs(grid.p), grid.q, grid.bump
     freckles = _waves(generator, grid, 60, 1.5, 2.3)
     cheeks_and_nose = np.maximum(bump(11.0, -2.0, 7.0, 4.5), bump(0.0, -4.0, 4.0, 4.0))
     arc = np.clip(1.0 - (p / 9.3) ** 2, 0.0, 1.0)
-    upper = MOUTH_Q - 2.9 * arc**0.9 + 0.55 * hill(p, 0.0, 1.3)
-    lower = MOUTH_Q + 3.6 * np.clip(1.0 - (p / 8.9) ** 2, 0.0, 1.0) ** 0.7
+    upper = head.MOUTH_Q - 2.9 * arc**0.9 + 0.55 * hill(p, 0.0, 1.3)
+    lower = head.MOUTH_Q + 3.6 * np.clip(1.0 - (p / 8.9) ** 2, 0.0, 1.0) ** 0.7
     lips = smoothstep(-0.45, 0.45, q - upper) * smoothstep(-0.6, 0.6, lower - q) * smoothstep(0.0, 0.08, arc)
-    away = ear_angle(grid)
+    away = head.ear_angle(grid)
     is_ear = (np.abs(q + 5.5) < 7.6) & (away > -0.14) & (away < 0.2)  # where an ear folds out of the head
     depths = ("fold", 0.30, 0.30), ("forehead_lines", 0.16, 0.12), ("crows_feet", 0.26, 0.16)
-    lines = sum(share * np.clip(age_lines(grid)[name] / top, 0.0, 1.0) for name, share, top in depths)
+    lines = sum(share * np.clip(head.age_lines(grid)[name] / top, 0.0, 1.0) for name, share, top in depths)
     parts = np.full(p.shape, PART["skin"], np.int32)
     width = np.interp(q, [-13.0, -6.0, -2.5, 0.0, 2.5, 4.0], [2.2, 3.4, 5.2, 6.4, 5.8, 3.0])
     for name, where in {  # left and right being the person's own
@@ -98,8 +84,8 @@ def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
         "l_ear": is_ear & (grid.p > 0),
         "r_ear": is_ear & (grid.p < 0),
         "neck": (q > 32.0) & ~is_ear,
-        "u_lip": (lips > 0.5) & (q <= MOUTH_Q),
-        "l_lip": (lips > 0.5) & (q > MOUTH_Q),
+        "u_lip": (lips > 0.5) & (q <= head.MOUTH_Q),
+        "l_lip": (lips > 0.5) & (q > head.MOUTH_Q),
     }.items():
         parts[where] = PART[name]
     fields = {
@@ -244,9 +230,7 @@ def _hair_distance(grid: FaceGrid, style: HairStyle, who: Identity) -> Float[nda
 
 
 def _hair_thickness(shape: FaceShape, style: HairStyle, volume: float, distance: ndarray) -> Any:
-    """How far hair stands off the head, and hanging hair comes forward of the neck, in face pixels. Hair
-    falls from the temples and makes up for the head's half width.
-    """
+    """How far hair stands off the head, and hanging hair comes forward of the neck, in face pixels."""
     theta, q = np.abs(shape.grid.theta), shape.grid.q
     crown = 1.0 - smoothstep(-42.0, -26.0, q)
     away = smoothstep(np.deg2rad(28.0), np.deg2rad(66.0), theta)
@@ -267,13 +251,13 @@ def paint_eyes(
 ) -> None:  # fmt: skip
     """Paint one person's eyes in place. lids: how wide and how squinted the eye at p < 0 and that at p > 0
     are; gaze: face pixels."""
-    rows, columns = np.abs(grid.q[:, 0] - EYE_Q) < 7.0, np.abs(np.abs(grid.p[0]) - EYE_P) < 8.0
+    rows, columns = np.abs(grid.q[:, 0] - head.EYE_Q) < 7.0, np.abs(np.abs(grid.p[0]) - head.EYE_P) < 8.0
     at = np.ix_(rows, columns)
-    colour, p, y = albedo[:, *at], _single(grid.p[:1, columns]), _single(grid.q[rows, :1] - EYE_Q)
+    colour, p, y = albedo[:, *at], _single(grid.p[:1, columns]), _single(grid.q[rows, :1] - head.EYE_Q)
     (wide, squint), (right, down) = lids[:, (p[0] > 0).astype(int)], gaze
     up = 2.35 * np.clip(who["eye_opening"] * (1.0 + 0.34 * wide - 0.42 * squint), 0.25, 1.7)
     low = 1.4 * np.clip(who["eye_opening"] * (1.0 + 0.2 * wide - 0.45 * squint), 0.2, 1.5)
-    outward, length, lashes = np.abs(p) - EYE_P, who["eye_length"], who["lashes"]
+    outward, length, lashes = np.abs(p) - head.EYE_P, who["eye_length"], who["lashes"]
     level, along = y + who["eye_tilt"] * outward, outward / length
     body = np.maximum(1.0 - along**2, 0.0)
     below_upper = level + up * body**0.75 * (1.0 - 0.12 * along)  # > 0 below the upper lid's edge
@@ -282,7 +266,7 @@ def paint_eyes(
     lid = gauss(below_upper, -0.9, 0.9) * hill(along, 0.0, 1.1, 4)
     colour *= (1.0 - 0.28 * fold) * (1.0 - 0.10 * lid)
     inside = np.where(body > 0.0, np.minimum(below_upper, above_lower) / 0.45 + 0.5, 0.0)
-    distance = np.hypot(p - np.sign(p) * EYE_P - right, level - down + 0.55)
+    distance = np.hypot(p - np.sign(p) * head.EYE_P - right, level - down + 0.55)
     shade = (1.0 - 0.28 * np.exp(-np.maximum(below_upper, 0.0) / 0.7)) * (1.0 - 0.12 * np.abs(along))
     rim = 1.15 - 0.75 * np.clip((distance - _IRIS_RADIUS + 0.7) / 0.55, 0.0, 1.0)
     ball, iris = shade * _SCLERA, rim * _rgb(who["iris"])
@@ -303,10 +287,10 @@ def paint_mouth(
     who: Identity, gap: Float32[ndarray, "columns"],
 ) -> None:  # fmt: skip
     """Paint one person's open mouth in place; ``gap`` is by how much the lips have parted, face pixels."""
-    rows, columns = np.abs(grid.q[:, 0] - MOUTH_Q) < 1.1 * MOUTH_BAND, np.abs(grid.p[0]) < 9.3
+    rows, columns = np.abs(grid.q[:, 0] - head.MOUTH_Q) < 1.1 * head.MOUTH_BAND, np.abs(grid.p[0]) < 9.3
     at = np.ix_(rows, columns)
     colour, p, gap = albedo[:, *at], _single(grid.p[:1, columns]), gap[columns]
-    across = _single((grid.q[rows, :1] - MOUTH_Q) / MOUTH_BAND)  # -1 upper lip's edge, 1 lower lip's edge
+    across = _single((grid.q[rows, :1] - head.MOUTH_Q) / head.MOUTH_BAND)  # -1, 1: the lips' edges
     lens = np.sqrt(1.0 - (p / 9.3) ** 2)
     below = 0.5 * (across + 1.0) * gap
     groove = 1.0 - 0.12 * hill(p - 1.9 * np.round(p / 1.9), 0.0, 0.25)
@@ -345,14 +329,15 @@ def built_in_person(
     labels |= {"build": round(who["build"], 4), "hair": who["hair_style"]}
     labels |= {"hair_colour": who["hair_colour"], "beard": who["beard"]}
 
-    def mesh(expression: Expression) -> TriangleMesh:
+    def mesh(expression: head.Expression) -> TriangleMesh:
         grid, sides = shape.grid, expression.sides
         surface, albedo, parts = neutral.copy(), skin.albedo.copy(), skin.parts.copy()
-        for a, side in np.argwhere(sides[: len(ACTIONS)]):
+        for a, side in np.argwhere(sides[: len(head.ACTIONS)]):
             surface += sides[a, side] * scale * shape.actions[2 * a + side]
-        top, bottom = np.searchsorted(grid.q[:, 0], [MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND])
+        edges = head.MOUTH_Q + head.MOUTH_BAND * np.array([-1.0, 1.0])
+        top, bottom = np.searchsorted(grid.q[:, 0], edges)
         paint_mouth(albedo, parts, grid, who, (surface[bottom, :, 1] - surface[top - 1, :, 1]) / scale)
-        paint_eyes(albedo, parts, grid, who, sides[len(ACTIONS) :], expression.gaze)
+        paint_eyes(albedo, parts, grid, who, sides[len(head.ACTIONS) :], expression.gaze)
         surface += np.array([0.0, _DOWN_PX, -nose_tip], np.float32)
         surface *= np.float32(_FACE_PX)  # scene units
         surface[..., 2] += np.float32(NOSE_TIP_Z)
