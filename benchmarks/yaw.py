@@ -1,4 +1,4 @@
-"""Trains the network that tells how far a face is turned to the side (derender.photo.yaw), and scores it.
+"""Trains the network that tells how far a face is turned to the side (derender.photo.faces), and scores it.
 
 Generated heads from -89 to 89 degrees, under ordinary and strong light, are cut out in the boxes of MTCNN;
 of LFW come the crops of the development half, with the yaw of a face mesh (``--lfw``, ``--points``). Scored
@@ -23,8 +23,15 @@ from derender.data.image import decode_whole
 from derender.data.layouts.layout import in_test_half
 from derender.data.synthetic import FaceSettings, faces
 from derender.photo import Frame, face_candidates
-from derender.photo.faces import PROFILE_DEG, _detected
-from derender.photo.yaw import CROP, CROP_SIDE, SCALE_DEG, standardised, yaw_network
+from derender.photo.faces import (
+    PROFILE_DEG,
+    YAW_CROP,
+    YAW_CROP_SIDE,
+    YAW_SCALE_DEG,
+    _detected,
+    standardised,
+    yaw_network,
+)
 from derender.storage.tensors import write_tensors
 
 WIDE = 1.5  # crops that views are drawn from, over the network's
@@ -66,9 +73,9 @@ def cut(photographs: Iterator[tuple]) -> tuple[Tensor, Tensor]:
         face = max(_detected(pixels), key=lambda face: face.confidence, default=None)
         if face is not None:
             left, top, right, bottom = face.box
-            side = WIDE * CROP_SIDE * max(right - left, bottom - top)
+            side = WIDE * YAW_CROP_SIDE * max(right - left, bottom - top)
             frame = Frame((left + right) / 2, (top + bottom) / 2, side)
-            crops.append(frame.cut(pixels, round(WIDE * CROP)))
+            crops.append(frame.cut(pixels, round(WIDE * YAW_CROP)))
             yaws.append(yaw)
     return torch.from_numpy(np.stack(crops)), torch.tensor(yaws)
 
@@ -80,7 +87,7 @@ def views(crops: Tensor) -> Tensor:
     roll, moved = 0.12 * torch.randn(count).clamp(-2, 2), 0.06 * torch.randn(count, 2)
     across, down = scale * roll.cos(), scale * roll.sin()
     rows = torch.stack([across, -down, moved[:, 0], down, across, moved[:, 1]], dim=1).view(-1, 2, 3)
-    grid = affine_grid(rows, [count, 3, CROP, CROP], align_corners=False)
+    grid = affine_grid(rows, [count, 3, YAW_CROP, YAW_CROP], align_corners=False)
     result = grid_sample(crops.float() / 255, grid, align_corners=False, padding_mode="border")
     if torch.rand(1) < 0.3:
         result = interpolate(avg_pool2d(result, 2), scale_factor=2, mode="bilinear")
@@ -100,7 +107,7 @@ def trained(sets: list[tuple[Tensor, Tensor]], sizes: list[int], steps: int) -> 
         chosen = [torch.randint(len(yaws), (size,)) for (_, yaws), size in zip(sets, sizes, strict=True)]
         pairs = list(zip(sets, chosen, strict=True))
         crops = torch.cat([crops[rows] for (crops, _), rows in pairs])
-        yaws = torch.cat([yaws[rows] for (_, yaws), rows in pairs]) / SCALE_DEG
+        yaws = torch.cat([yaws[rows] for (_, yaws), rows in pairs]) / YAW_SCALE_DEG
         mirrored = torch.rand(len(yaws)) < 0.5
         crops = torch.where(mirrored[:, None, None, None], crops.flip(-1), crops)
         predicted = network(standardised(views(crops)))[:, 0]

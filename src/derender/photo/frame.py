@@ -14,15 +14,10 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-BORDER_SHARE = 1 / 16
-"""Width over which an edited crop fades into its photograph, of the crop's side."""
-
-GONE = 0.05
-"""Change from which a moved thing's fine detail is gone from where it was."""
-
-
-BESIDE = 4
-"""Pixels around what is visible that are drawn as well, at least; in such steps, for threads to share."""
+Pixels = UInt8[np.ndarray, "h w 3"]  # a photograph
+BORDER_SHARE = 1 / 16  # width over which an edited crop fades into its photograph, of the crop's side
+GONE = 0.05  # change from which a moved thing's fine detail is gone from where it was
+BESIDE = 4  # pixels around what is visible that are drawn, too; in such steps, for threads to share
 
 
 @dataclass(frozen=True)
@@ -69,16 +64,12 @@ class Frame:
 
     def within(self, other: "Frame") -> dict[str, float]:
         """Side as a share of another frame's, and centre from -1 to 1 across and down it."""
-        return {
-            "side": round(self.side / other.side, 6),
-            "across": round(2 * (self.x - other.x) / other.side, 6),
-            "down": round(2 * (self.y - other.y) / other.side, 6),
-        }
+        place = {"side": self.side, "across": 2 * (self.x - other.x), "down": 2 * (self.y - other.y)}
+        return {name: round(value / other.side, 6) for name, value in place.items()}
 
     def corners(self) -> list[tuple[float, float]]:
         """Upper left, upper right, lower right, lower left, in pixels."""
-        half, angle = self.side / 2, radians(self.roll_deg)
-        c, s = cos(angle), sin(angle)
+        c, s, half = cos(radians(self.roll_deg)), sin(radians(self.roll_deg)), self.side / 2
         signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         return [(self.x + half * (c * u - s * v), self.y + half * (s * u + c * v)) for u, v in signs]
 
@@ -93,7 +84,7 @@ class Frame:
         last = np.clip(high, BESIDE, size).astype(int).tolist()
         return slice(first[0], last[0]), slice(first[1], last[1])
 
-    def cut(self, photo: UInt8[np.ndarray, "h w 3"], size: int) -> UInt8[np.ndarray, "3 size size"]:
+    def cut(self, photo: Pixels, size: int) -> UInt8[np.ndarray, "3 size size"]:
         """The part at ``size`` x ``size``, antialiased; beyond the photograph its border is continued."""
         angle = radians(self.roll_deg)
         around = self.side if self.upright else self.side * (abs(cos(angle)) + abs(sin(angle)) + 6 / size)
@@ -114,11 +105,11 @@ class Frame:
 
     def paste(
         self,
-        photo: UInt8[np.ndarray, "h w 3"],
+        photo: Pixels,
         before: Float[Tensor, "3 s s"],
         after: Float[Tensor, "3 s s"],
         moved: bool = False,
-    ) -> UInt8[np.ndarray, "h w 3"]:
+    ) -> Pixels:
         """The photograph with an edited crop (0..1): what changed is added, so the rest keeps its pixels.
 
         Detail finer than the crop stays where it is; where things ``moved``, it goes with what is changed.
@@ -129,28 +120,27 @@ class Frame:
         right, bottom = min(width, ceil(max(across))), min(height, ceil(max(down)))
         if left >= right or top >= bottom:
             return photo
-        change = ((after - before) * _window(after.shape[-1]).to(after))[None].cpu()
-        angle, half = radians(self.roll_deg), self.side / 2
+        centres = (torch.arange(after.shape[-1]) + 0.5) / after.shape[-1]
+        rise = (torch.minimum(centres, 1 - centres) / BORDER_SHARE).clamp(0, 1).to(after)
+        change = (after - before) * (rise * rise[:, None])  # which fades to 0 at the border
+        c, s, half = cos(radians(self.roll_deg)), sin(radians(self.roll_deg)), self.side / 2
         u = (torch.arange(left, right) + 0.5 - self.x)[None] / half
         v = (torch.arange(top, bottom) + 0.5 - self.y)[:, None] / half
-        grid = torch.stack(
-            (cos(angle) * u + sin(angle) * v, cos(angle) * v - sin(angle) * u), dim=-1
-        )[None].float()  # fmt: skip
-        both = torch.cat((change, before[None].cpu()), dim=1)
-        both = sampled(both, grid, padding_mode="zeros")
+        grid = torch.stack((c * u + s * v, c * v - s * u), dim=-1)[None].float()
+        both = sampled(torch.cat((change, before))[None].cpu(), grid, padding_mode="zeros")
         added, old = both.split(3, dim=1)
-        pasted = photo.copy()
         region = torch.from_numpy(photo[top:bottom, left:right].astype(np.float32) / 255).permute(2, 0, 1)
         if moved:
             most = cv2.dilate(added[0].abs().amax(dim=0).numpy(), np.ones((3, 3)))
             gone = (torch.from_numpy(most) / GONE).clamp(0, 1)
             added = added + gone * (old - region)
         edited = (255 * (region + added[0])).round().clamp(0, 255)
+        pasted = photo.copy()
         pasted[top:bottom, left:right] = edited.permute(1, 2, 0).to(torch.uint8).numpy()
         return pasted
 
 
-def resized(photo: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+def resized(photo: Pixels, side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     """The photograph with its longer side of so many pixels, antialiased."""
     height, width = photo.shape[:2]
     share = side / max(height, width)
@@ -175,10 +165,3 @@ def look_up(
     """Square maps at pixel coordinates (across, down), as ``sampled`` does it."""
     grid = place.permute(0, 2, 3, 1) * 2 / (maps.shape[-1] - 1) - 1
     return sampled(maps, grid, mode=mode, padding_mode="border", align_corners=True)
-
-
-def _window(size: int) -> Float[Tensor, "s s"]:
-    """1 inside a square, 0 at its border."""
-    centres = (torch.arange(size) + 0.5) / size
-    rise = (torch.minimum(centres, 1 - centres) / BORDER_SHARE).clamp(0, 1)
-    return rise * rise[:, None]

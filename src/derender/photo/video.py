@@ -14,22 +14,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 
 from derender.model import Derenderer
 from derender.photo.edit import Photograph, editable_scenes, found_frame
 from derender.photo.faces import UTKFACE, find_faces, frame_of, template_of
-from derender.photo.frame import Frame
+from derender.photo.frame import Frame, Pixels
 from derender.scene import Scene
 from derender.storage.atomic import atomic_file
 from derender.storage.places import require_known
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi")
-SEARCH_EVERY_SECONDS = 0.2
-"""Time between frames in which the face is looked for; its place in between is interpolated."""
+SEARCH_EVERY_SECONDS = 0.2  # time between frames searched for the face; in between it is interpolated
 SMOOTH_SECONDS = {"place": 0.15, "depth": 0.5, "albedo": 0.5, "light": 0.3, "camera": 0.1}
 """Standard deviation of the Gaussian over time."""
 LONGEST_FRAMES = 18_000
@@ -41,18 +40,15 @@ Edit = Callable[[Scene], Mapping[str, Tensor]]
 
 @dataclass(frozen=True)
 class EditedVideo:
-    """What `edit_video` wrote: number, size and rate of its frames.
-
-    A face was ``found`` in so many of the frames ``searched``.
-    """
+    """What `edit_video` wrote: number, size and rate of its frames."""
 
     out: Path
     frames: int
     width: int
     height: int
     fps: float
-    searched: int
-    found: int
+    searched: int  # frames in which a face was looked for
+    found: int  # and in which it was found
 
 
 def edit_video(
@@ -62,9 +58,6 @@ def edit_video(
     """Edit every frame of a video, and write it as MP4 with its sound.
 
     Args:
-        video: the file.
-        out: the .mp4 to write.
-        model: trained.
         edit: gives new parameters for the scenes of all frames.
         fit_steps: as `editable_scenes` takes them.
         frame: "face", the default of models of faces, or "none", the middle square.
@@ -75,8 +68,6 @@ def edit_video(
     """
     video, out, report = Path(video), Path(out), progress or (lambda *_, **__: None)
     require_known("frame of a video", frame or "none", ("face", "none"))
-    import cv2
-
     reader = _opened(video)
     fps, total = reader.get(cv2.CAP_PROP_FPS), int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     reader.release()
@@ -106,7 +97,7 @@ def edit_video(
     scene = _smooth(Scene.joined(scenes), fps)
     edited = scene.with_parameters(**edit(scene))
 
-    def drawn() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    def drawn() -> Iterator[Pixels]:
         for number, pixels in enumerate(_frames(video)):
             photo = Photograph.of(pixels, frames[number], scene[number], model)
             result = photo.edited(**edited[number].parameters)
@@ -124,9 +115,8 @@ def is_video(path: Path) -> bool:
 
 
 def write_video(
-    out: Path, frames: Iterator[UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], fps: float,
-    sound: Path | None = None,
-) -> None:  # fmt: skip
+    out: Path, frames: Iterator[Pixels], size: tuple[int, int], fps: float, sound: Path | None = None
+) -> None:
     """Frames as H.264 in MP4, odd sides less a pixel, with the sound of another file, if it has any."""
     from imageio_ffmpeg import get_ffmpeg_exe, write_frames
 
@@ -156,8 +146,6 @@ def _opened(video: Path) -> Any:
     if not video.is_file():
         raise FileNotFoundError(f"{video} does not exist")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # a damaged file is named once, by us
-    import cv2
-
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     reader = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     cv2.utils.logging.setLogLevel(level)
@@ -166,7 +154,7 @@ def _opened(video: Path) -> Any:
     return reader
 
 
-def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def _frames(video: Path) -> Iterator[Pixels]:
     reader = _opened(video)
     try:
         while (read := reader.read())[0]:

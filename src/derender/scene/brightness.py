@@ -19,16 +19,13 @@ _LEAST = 1e-3
 
 
 class BrightnessPrior(Settings):
-    """Linear in log chroma (red and blue over green): log luminance of an albedo, and of albedo times light.
-
-    ``share`` of what the product lies above its expectation is the albedo's.
-    """
+    """Linear in log chroma (red, blue over green): log luminance of an albedo, and of albedo times light."""
 
     red: float
     blue: float
     albedo: float
     product: float
-    share: float = Field(default=0.2, ge=0, le=1)
+    share: float = Field(default=0.2, ge=0, le=1)  # albedo's, of the product above its expectation
 
     @classmethod
     def of(cls, cues: Float[Tensor, "n 4"]) -> "BrightnessPrior":
@@ -50,10 +47,8 @@ class BrightnessPrior(Settings):
         brightest = scene.albedo.flatten(1).amax(dim=1).clamp(min=_LEAST)
         factor = torch.minimum(factor, (1 / brightest).clamp(min=1))[:, None]
         intensity, direction = scene.light.split(2, dim=1)
-        return scene.with_parameters(
-            albedo=scene.albedo * factor[..., None, None],
-            light=torch.cat([intensity / factor, direction], dim=1),
-        )
+        light = torch.cat([intensity / factor, direction], dim=1)
+        return scene.with_parameters(albedo=scene.albedo * factor[..., None, None], light=light)
 
 
 def brightness_cues(scene: Scene) -> Float[Tensor, "n 4"]:
@@ -61,9 +56,8 @@ def brightness_cues(scene: Scene) -> Float[Tensor, "n 4"]:
 
     The mean is weighted by a Hann window over the canonical map, whose middle is the object's.
     """
-    height, width = scene.albedo.shape[-2:]
     along, across = (
-        torch.hann_window(size + 2, periodic=False).to(scene.albedo)[1:-1] for size in (height, width)
+        torch.hann_window(size + 2, periodic=False).to(scene.albedo)[1:-1] for size in scene.albedo.shape[-2:]
     )
     window = along[:, None] * across
     colour = ((scene.albedo * window).sum(dim=(2, 3)) / window.sum()).clamp(min=_LEAST)

@@ -27,6 +27,13 @@ from derender.scene.ranges import SceneRanges
 from derender.scene.scene import Scene
 from derender.settings import Settings
 
+Crops = Float[Tensor, "n 2 3"]  # affine maps, as above
+SIDES = (0.9, 0.8, 0.7, 0.6, 0.5)
+STEP = 0.1
+FARTHEST_ACROSS, FARTHEST_DOWN = 0.2, 0.3
+GAIN = 0.8  # a crop is chosen where its error is below this share of the whole image's
+SEARCH_SCALE = 2  # how many times the model's size images should have in which crops are searched
+_LEAST_VARIANCE = 1e-4
 _IDENTITY = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _REACH = 0.75  # of a range: towards its end a network's output hardly moves
 
@@ -43,9 +50,7 @@ class CropSettings(Settings):
 DEFAULT_CROPS = CropSettings()
 
 
-def random_crops(
-    count: int, generator: Generator, settings: CropSettings, share: float = 1.0
-) -> Float[Tensor, "n 2 3"]:
+def random_crops(count: int, generator: Generator, settings: CropSettings, share: float = 1.0) -> Crops:
     """A random crop for each image with probability ``share``, and the identity for the others."""
 
     def uniform(low: float, high: float) -> Tensor:
@@ -59,35 +64,33 @@ def random_crops(
     return torch.where(unchanged.view(-1, 1, 1), _IDENTITY, crops)
 
 
-def similarities(parameters: Float[Tensor, "n 4"]) -> Float[Tensor, "n 2 3"]:
+def similarities(parameters: Float[Tensor, "n 4"]) -> Crops:
     """Crops of these logarithms of scale, rolls in radians, and places of the centre across and down."""
     scale, roll, across, down = parameters.unbind(dim=1)
     cosine, sine = roll.cos() * scale.exp(), roll.sin() * scale.exp()
     return torch.stack([cosine, -sine, across, sine, cosine, down], dim=1).view(-1, 2, 3)
 
 
-def parameters_of(crops: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 4"]:
+def parameters_of(crops: Crops) -> Float[Tensor, "n 4"]:
     """What `similarities` makes these crops of."""
     cosine, sine = crops[:, 0, 0], crops[:, 1, 0]
     return torch.stack([torch.hypot(cosine, sine).log(), torch.atan2(sine, cosine), *crops[:, :, 2].T], dim=1)
 
 
-def within(inner: Float[Tensor, "n 2 3"], outer: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+def within(inner: Crops, outer: Crops) -> Crops:
     """Crops of crops: where the inner ones lie in the image that the outer ones are cut from."""
     turned = outer[:, :, :2] @ inner
     return torch.cat([turned[:, :, :2], turned[:, :, 2:] + outer[:, :, 2:]], dim=2)
 
 
-def back(crops: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+def back(crops: Crops) -> Crops:
     """Where the image's points lie in each crop: a crop of a crop by this is the image."""
     turned = torch.linalg.inv(crops[:, :, :2])
     return torch.cat([turned, -turned @ crops[:, :, 2:]], dim=2)
 
 
 def crop_images(
-    images: Float[Tensor, "n c h w"],
-    crops: Float[Tensor, "n 2 3"],
-    surroundings: Float[Tensor, "n c h w"] | None = None,
+    images: Float[Tensor, "n c h w"], crops: Crops, surroundings: Float[Tensor, "n c h w"] | None = None
 ) -> Float[Tensor, "n c h w"]:
     """Each image in its crop, bilinear; the identity crop returns the image bit for bit.
 
@@ -110,7 +113,7 @@ def other_surroundings(images: Float[Tensor, "n 3 h w"], generator: Generator) -
     return interpolate(coarse, images.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def crop_scene(scene: Scene, crops: Float[Tensor, "n 2 3"], fov_deg: float) -> Scene:
+def crop_scene(scene: Scene, crops: Crops, fov_deg: float) -> Scene:
     """The scenes of images in crops that are similarities, as `random_crops` makes them: cameras change.
 
     Exact at the distance of the object's middle; with a field of view of 10 degrees the rest is off by less
@@ -135,18 +138,6 @@ def ranges_for_crops(ranges: SceneRanges, width: int, settings: CropSettings) ->
     aside = math.sqrt(2) * settings.shift * settings.farther / focal / _REACH
     wider = {"translation_xy": max(ranges.translation_xy, aside)}
     return ranges.model_copy(update=wider | {"translation_z": max(ranges.translation_z, away)})
-
-
-SIDES = (0.9, 0.8, 0.7, 0.6, 0.5)
-STEP = 0.1
-FARTHEST_ACROSS, FARTHEST_DOWN = 0.2, 0.3
-GAIN = 0.8
-"""A crop is chosen where its error is below this share of the whole image's."""
-
-SEARCH_SCALE = 2
-"""How many times the model's size images should have in which crops are searched."""
-
-_LEAST_VARIANCE = 1e-4
 
 
 @dataclass(frozen=True)

@@ -89,10 +89,7 @@ def _uniform_about(
     value: Float[Tensor, "n k"], changes: Sequence[float], bounds: Sequence[tuple[float, float]],
     generator: Generator,
 ) -> Float[Tensor, "n k"]:  # fmt: skip
-    """Uniform over the part of [value - change, value + change] inside the bounds, with gradient to value.
-
-    A value outside the bounds is first brought to the nearest one.
-    """
+    """Uniform within the bounds and each value's change; a value outside is first brought to the bound."""
     low, high = constant(tuple(bounds), value).unbind(dim=1)
     half_width = constant(tuple(changes), value)
     inside = torch.minimum(torch.maximum(value, low), high)

@@ -12,6 +12,13 @@ from torch import Tensor
 
 from derender.scene.environment import main_light
 
+_FIELDS = ("depth", "albedo", "light", "camera")
+_SIGNS = {  # in a mirror
+    "light": (1.0, 1.0, 1.0, -1.0),  # ambient, diffuse, pitch, yaw
+    "camera": (1.0, -1.0, -1.0, -1.0, 1.0, 1.0),  # rotation about x, y, z; translation along x, y, z
+    "environment": (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0),  # of each channel
+}
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -40,8 +47,7 @@ class Scene:
         """
         if "environment" in parameters and "light" not in parameters:
             parameters = {**parameters, "light": main_light(parameters["environment"])}
-        missing = [name for name in _FIELDS if name not in parameters]
-        if missing:
+        if missing := [name for name in _FIELDS if name not in parameters]:
             raise ValueError(f"a scene needs {', '.join(_FIELDS)}; missing: {', '.join(missing)}")
         extra = {name: value for name, value in parameters.items() if name not in _FIELDS}
         return cls(*(parameters[name] for name in _FIELDS), extra=extra)
@@ -68,12 +74,9 @@ class Scene:
 
         A light takes the place of an environment, and an environment brings its main light.
         """
-        unknown = sorted(set(changed) - set(self.parameters))
-        if unknown:
-            raise ValueError(
-                f"unknown scene parameter {unknown[0]!r}; this scene has {', '.join(self.parameters)}"
-            )
-        kept = dict(self.parameters)
+        kept = self.parameters
+        if unknown := sorted(set(changed) - set(kept)):
+            raise ValueError(f"unknown scene parameter {unknown[0]!r}; this scene has {', '.join(kept)}")
         for one, other in (("light", "environment"), ("environment", "light")):
             if one in changed and other not in changed and "environment" in kept:
                 del kept[other]
@@ -97,14 +100,6 @@ class Scene:
 
     def __len__(self) -> int:
         return self.depth.shape[0]
-
-
-_FIELDS = ("depth", "albedo", "light", "camera")
-_SIGNS = {  # in a mirror
-    "light": (1.0, 1.0, 1.0, -1.0),  # ambient, diffuse, pitch, yaw
-    "camera": (1.0, -1.0, -1.0, -1.0, 1.0, 1.0),  # rotation about x, y, z; translation along x, y, z
-    "environment": (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0),  # of each channel
-}
 
 
 def seen_in_mirror(scene: Scene, even: Collection[str] = ()) -> Scene:

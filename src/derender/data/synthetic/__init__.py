@@ -51,8 +51,7 @@ KINDS = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSet
 PARTS = {
     kind: {name: BenchmarkPart(**row) for name, row in numbers_of(kind)["benchmark"].items()}
     for kind in KINDS
-}
-"""By kind and folder."""
+}  # by kind and folder
 
 
 def write_generated(

@@ -29,6 +29,7 @@ PARTS = ("background", "body", "window", "wheel", "light", "trim", "plate")
 ARCH = 1.13  # radius of the wheel arches in wheel radii
 BED_FROM, BED_TO, BED_SIDE = 6.12, 6.93, 0.86
 Colour = tuple[float, float, float]
+Points = Float[ndarray, "points 3"]
 Decal = tuple[float, ...]  # the columns of one shape, as in mesh_image
 Places = Mapping[str, float]  # lengths by name, as ``cars.yaml`` uses them
 _LAST = 9  # station
@@ -106,7 +107,6 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
     cells = [grid_triangles(*g.points.shape[:2], (g.points.shape[1] - 1) / 2) for g in pieces]
     surfaces = list(dict.fromkeys(g.surface for g in pieces))
     owner = np.array([surfaces.index(g.surface) for g in pieces], np.int32)
-    rows = [d for s in surfaces for d in s.decals]
     vertices, normals, chart = (
         np.concatenate([each.reshape(-1, each.shape[-1]) for each in arrays])
         for arrays in zip(*(g[:3] for g in pieces), strict=True)
@@ -122,7 +122,7 @@ def join(pieces: Sequence[Grid]) -> TriangleMesh:
             part=np.array([PARTS.index(s.part) for s in surfaces], np.int32),
             holes=np.array([s.holes for s in surfaces], np.float32),
             first=np.cumsum([0, *(len(s.decals) for s in surfaces)]).astype(np.int32),
-            decals=np.array(rows, np.float32).reshape(-1, DECAL_LENGTH),
+            decals=np.array([d for s in surfaces for d in s.decals], np.float32).reshape(-1, DECAL_LENGTH),
         ),
     )
 
@@ -174,9 +174,7 @@ def wheel(
     return grid
 
 
-def wheel_house(
-    inside: float, at: float, shape: CarShape, flank: Float[ndarray, "points 3"], surface: Surface
-) -> Grid:
+def wheel_house(inside: float, at: float, shape: CarShape, flank: Points, surface: Surface) -> Grid:
     """The hollow of the wheel arch at z = ``at`` on the right: a disc at x = ``inside`` and the wall out to
     the body's side; nothing reaches below the sill."""
     radius = ARCH * shape.wheel + 0.01
@@ -188,7 +186,7 @@ def wheel_house(
     return smooth_grid(points, points[..., [2, 1]], surface)
 
 
-def half_width(flank: Float[ndarray, "points 3"], z: Any, y: Any) -> Any:
+def half_width(flank: Points, z: Any, y: Any) -> Any:
     """The body's half width about those places, from the points of its right side."""
     away = (flank[:, 2] - np.asarray(z)[..., None]) ** 2 + (flank[:, 1] - np.asarray(y)[..., None]) ** 2
     return flank[np.argmin(away, axis=-1), 0]
@@ -234,9 +232,7 @@ def body_lines(shape: CarShape, stations: Float[ndarray, "t"]) -> BodyLines:
     return BodyLines(*(rows[:, i : i + 3] for i in (0, 3, 6, 9)))
 
 
-def body_pieces(
-    shape: CarShape, top: Surface, side: Surface
-) -> tuple[list[Grid], Float[ndarray, "points 3"]]:
+def body_pieces(shape: CarShape, top: Surface, side: Surface) -> tuple[list[Grid], Points]:
     """The body, and the points of its right side. Top's chart is (share of the half width to either side,
     station), side's (z, y)."""
     between = [i + np.arange(n) / n for i, n in enumerate(_ROWS_BETWEEN)]

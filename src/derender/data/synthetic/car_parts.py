@@ -200,13 +200,12 @@ def checker(
     finish: Finish, u0: float, v0: float, u1: float, v1: float, across: float, along: float, odd: float = 0
 ) -> list[Decal]:
     """Every second field, so wide and high, of a chequered rectangle."""
-    return [
-        decal
-        for i, u in enumerate(np.arange(u0, u1, across).tolist())
-        for j, v in enumerate(np.arange(v0, v1, along).tolist())
-        if (i + j) % 2 == odd
-        for decal in box(finish, u, v, min(u + across, u1), min(v + along, v1))
-    ]
+    decals = []
+    for i, u in enumerate(np.arange(u0, u1, across).tolist()):
+        for j, v in enumerate(np.arange(v0, v1, along).tolist()):
+            if (i + j) % 2 == odd:
+                decals += box(finish, u, v, min(u + across, u1), min(v + along, v1))
+    return decals
 
 
 def word(finish: Finish, v: float, half: float, tall: float) -> list[Decal]:
@@ -258,9 +257,8 @@ def _door_edges(car: CarTraits) -> list[float]:
 
 def _windows(car: CarTraits, lines: body.BodyLines, doors: list[float]) -> list[Decal]:
     waist, edge = (side[:, 2:0:-1] for side in (lines.waist, lines.edge))
-    corners = np.concatenate([
-        waist[[70, 84, 100, 110]] + (0.0, 0.035), edge[[105, 98, 88, 79, 72]] - (0.0, 0.05),
-    ])  # fmt: skip
+    below, above = waist[[70, 84, 100, 110]] + (0.0, 0.035), edge[[105, 98, 88, 79, 72]] - (0.0, 0.05)
+    corners = np.concatenate([below, above])
     corners[[4, 7, 8]] += [(-0.06, 0.0), (0.05, 0.0), (0.09, 0.03)]
     outline = corners + 0.035 * np.sign(corners - corners.mean(axis=0))
     decals = polygon(car.finish("outline", "trim"), outline) + polygon(car.finish("glass", "window"), corners)

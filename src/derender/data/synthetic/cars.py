@@ -29,7 +29,7 @@ from derender.data.synthetic.synthetic_set import FOV_DEG, Row, Shot, SyntheticS
 CANONICAL_ELEVATION_DEG = 42.5
 _GOLDEN = 0.6180339887498949
 _PAINT_WHITE, _PAINT_BLACK = (0.92, 0.92, 0.91), (0.075, 0.075, 0.08)
-_PLACES = [name for name in CarShape._fields if name.endswith("_at")]
+_ALONG = ["length", "front_wheel", "rear_wheel", *(one for one in CarShape._fields if one.endswith("_at"))]
 _UP = ("height", "nose", "cowl", "deck", "tail", "bumper")
 _PLASTIC = {"suv": 0.6, "van": 0.6, "pickup": 0.6, "jeep": 1.0, "hatchback": 0.15}  # chance of such bumpers
 
@@ -55,8 +55,7 @@ def generate(
 
 @dataclass(frozen=True)
 class Car:
-    """A model: its traits (and those that tables name), its mesh in the canonical frame, relative to the
-    object's centre, at its size."""
+    """A model: traits, a row of them for tables, its mesh about its centre in the canonical frame."""
 
     traits: CarTraits
     row: Row
@@ -103,15 +102,11 @@ def draw_car(seed: int, index: int, image_size: int, settings: CarSettings, car:
     name = car.traits.name
     labels: Row = {"class": name, "style": car.traits.style, "model": f"{name}/{number:05d}"}
     labels |= {"elev": np.float32(elevation), "azim": np.float32(azimuth), "inplane": np.float32(inplane)}
-    return Shot(
-        car.mesh,
-        draw_background(kind, generator, image_size),
-        settings.light.draw(uniform[2:7], settings.brightest),
-        np.array([*Rotation.from_matrix(rotation).as_euler("xyz"), *shift, 0.0], np.float32),  # R = Rz Ry Rx
-        number,
-        labels,
-        car.row,
-    )
+    background = draw_background(kind, generator, image_size)
+    light = settings.light.draw(uniform[2:7], settings.brightest)
+    angles = Rotation.from_matrix(rotation).as_euler("xyz")  # R = Rz Ry Rx
+    camera = np.array([*angles, *shift, 0.0], np.float32)
+    return Shot(car.mesh, background, light, camera, number, labels, car.row)
 
 
 def about_x(angle_deg: float) -> Float64[ndarray, "3 3"]:
@@ -151,8 +146,7 @@ def _draw_shape(style: str, generator: np.random.Generator, stretch: float) -> C
     row = CarShape(*numbers_of("cars")["measures"][style])
     normal = np.clip(generator.standard_normal(len(row)), -2.0, 2.0).tolist()
     factor = {name: 1.0 + 0.03 * z for name, z in zip(CarShape._fields, normal, strict=True)}
-    along = ("length", "front_wheel", "rear_wheel", *_PLACES)
-    common = dict.fromkeys(along, factor["length"]) | dict.fromkeys(_UP, factor["height"])  # as ordered
+    common = dict.fromkeys(_ALONG, factor["length"]) | dict.fromkeys(_UP, factor["height"])  # as ordered
     drawn_row = {name: value * (factor | common)[name] for name, value in row._asdict().items()}
     between = factor["cowl"] - 1.0  # a longer or shorter bonnet moves the windscreen as a whole
     drawn_row["cowl_at"] += 1.2 * between

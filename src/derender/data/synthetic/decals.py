@@ -23,14 +23,11 @@ DECAL_LENGTH = _OWN + 2 * MOST_CORNERS
 
 
 class Paint(NamedTuple):
-    """Surfaces as arrays: k has rows ``first[k]`` to ``first[k + 1]`` of ``decals``.
-
-    ``holes`` are circles (u, v, radius) where there is no surface, of radius 0 where there is no hole.
-    """
+    """Surfaces as arrays: k has rows ``first[k]`` to ``first[k + 1]`` of ``decals``."""
 
     colour: ndarray  # (surfaces, 3) float32
     part: ndarray  # (surfaces,) int32
-    holes: ndarray  # (surfaces, 2, 3) float32
+    holes: ndarray  # (surfaces, 2, 3) float32: circles (u, v, radius) without surface; of radius 0 for none
     first: ndarray  # (surfaces + 1,) int32
     decals: ndarray  # (decals, DECAL_LENGTH) float32
 

@@ -77,7 +77,7 @@ class Expression:
 def face_shape(detail: float = 1.0) -> FaceShape:
     """The family on a grid with ``detail`` times the rows and columns that suit a 64-pixel image."""
     numbers, grid = numbers_of("faces"), _grid(detail)
-    fields, head = _named_fields(grid), _bare_head(grid)
+    fields, head = named_fields(grid), _bare_head(grid)
     left = 1.0 - smoothstep(-4.0, 4.0, grid.p)[..., None]
     actions = []
     for name in ACTIONS:
@@ -144,15 +144,21 @@ def _displacement(grid: FaceGrid, fields: dict[str, ndarray], terms: list[list[A
     return out
 
 
-def _named_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns"]]:
+def named_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns"]]:
+    """Fields by the names that terms have in ``faces.yaml``; lines of age in face pixels."""
     p, q = np.abs(grid.p), grid.q
+    wave = np.sin(2.0 * np.pi * (q + 25.0 + 0.5 * np.cos(p / 6.0)) / 3.1)
+    away, level = p - 17.4, q - EYE_Q
+    fan = np.sin(9.0 * np.arctan2(level, np.maximum(away, 0.05) + 1.5))
     below_line = smoothstep(MOUTH_Q - MOUTH_BAND, MOUTH_Q + MOUTH_BAND, q)
     lens = np.sqrt(np.clip(1.0 - (p / 9.2) ** 2, 0.0, 1.0))
     hinge = hill(p, 0.0, 24.0, 4) * (1.0 - smoothstep(33.0, 52.0, q))
     steps = {name: smoothstep(low, high, q) for name, (low, high) in numbers_of("faces")["steps"].items()}
     return {
         **steps,
-        **age_lines(grid),
+        "fold": 0.3 * _fold(p, q, 4.6, 1.0),  # the lines of age
+        "forehead_lines": 0.12 * wave * hill(q, -26.0, 4.6, 4) * hill(p, 0.0, 15.0, 4),
+        "crows_feet": 0.16 * fan * hill(away, 2.2, 2.4, 4) * hill(level, 0.0, 3.6, 4),
         "p": grid.p,
         "side": np.sin(grid.theta),
         "sideways": np.tanh(grid.p / 3.0),
@@ -167,19 +173,6 @@ def _named_fields(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns"]]:
         "nose_wrinkles": np.sin(2.0 * np.pi * (q + 11.0) / 3.0),
         "brow_middle": hill(p, 0.0, 9.0, 4),
         "wrinkle": np.sin(2.0 * np.pi * (q + 25.0) / 2.6) * hill(q, -24.3, 2.6, 4) * hill(p, 0.0, 13.0, 4),
-    }
-
-
-def age_lines(grid: FaceGrid) -> dict[str, Float[ndarray, "rows columns"]]:
-    """Depth of the lines of age: up to 0.3, 0.12 and 0.16 face pixels."""
-    p, q = np.abs(grid.p), grid.q
-    wave = np.sin(2.0 * np.pi * (q + 25.0 + 0.5 * np.cos(p / 6.0)) / 3.1)
-    away, level = p - 17.4, q - EYE_Q
-    fan = np.sin(9.0 * np.arctan2(level, np.maximum(away, 0.05) + 1.5))
-    return {
-        "fold": 0.3 * _fold(p, q, 4.6, 1.0),
-        "forehead_lines": 0.12 * wave * hill(q, -26.0, 4.6, 4) * hill(p, 0.0, 15.0, 4),
-        "crows_feet": 0.16 * fan * hill(away, 2.2, 2.4, 4) * hill(level, 0.0, 3.6, 4),
     }
 
 

@@ -23,6 +23,8 @@ from derender.data.synthetic.morphable import NOSE_TIP_Z, MeshOf
 from derender.data.synthetic.settings import FaceSettings, numbers_of
 from derender.data.synthetic.synthetic_set import Row
 
+Albedo = Float32[ndarray, "3 rows columns"]  # 0..1
+Parts = Int32[ndarray, "rows columns"]  # numbers into MASK_CLASSES
 PART = {name: number for number, name in enumerate(MASK_CLASSES)}
 _FIELD_SEED = 7  # the noise fields are part of the model, the same for everyone; identities mix them
 _HANG = 27.5  # half width at which hair falls past jaw and neck
@@ -56,10 +58,10 @@ class HairStyle(NamedTuple):
 class Skin(NamedTuple):
     """One person's surface."""
 
-    albedo: Float32[ndarray, "3 rows columns"]  # 0..1
+    albedo: Albedo
     thickness: Float32[ndarray, "rows columns"]  # of hair and clothes, face pixels
     forward: Float32[ndarray, "rows columns"]  # how far hair hangs forward, face pixels
-    parts: ndarray  # numbers into MASK_CLASSES
+    parts: Parts
 
 
 @lru_cache(maxsize=4)
@@ -76,7 +78,8 @@ def skin_fields(detail: float = 1.0) -> dict[str, ndarray]:
     away = head.ear_angle(grid)
     is_ear = (np.abs(q + 5.5) < 7.6) & (away > -0.14) & (away < 0.2)  # where an ear folds out of the head
     depths = ("fold", 0.30, 0.30), ("forehead_lines", 0.16, 0.12), ("crows_feet", 0.26, 0.16)
-    lines = sum(share * np.clip(head.age_lines(grid)[name] / top, 0.0, 1.0) for name, share, top in depths)
+    named = head.named_fields(grid)
+    lines = sum(share * np.clip(named[name] / top, 0.0, 1.0) for name, share, top in depths)
     parts = np.full(p.shape, PART["skin"], np.int32)
     width = np.interp(q, [-13.0, -6.0, -2.5, 0.0, 2.5, 4.0], [2.2, 3.4, 5.2, 6.4, 5.8, 3.0])
     for name, where in {  # left and right being the person's own
@@ -171,17 +174,11 @@ def paint_skin(who: Identity, style: HairStyle, shape: FaceShape, fields: dict[s
     root = 1.0 - 0.25 * smoothstep(0.0, 3.0, 3.0 - np.abs(distance))
     _over(albedo, strand_colour * _single((1.0 + 0.10 * style.curl * fields["curls"]) * root), hair)
     parts[hair > 0.5] = PART["hair"]
-    return Skin(
-        np.clip(albedo, 0.0, 1.0),
-        np.maximum(thickness + 1.2 * cloth, lift).astype(np.float32),
-        forward.astype(np.float32),
-        parts,
-    )
+    thickness = _single(np.maximum(thickness + 1.2 * cloth, lift))
+    return Skin(np.clip(albedo, 0.0, 1.0), thickness, _single(forward), parts)
 
 
-def _bare_skin(
-    who: Identity, fields: dict[str, ndarray], style: HairStyle
-) -> Float32[ndarray, "3 rows columns"]:
+def _bare_skin(who: Identity, fields: dict[str, ndarray], style: HairStyle) -> Albedo:
     age, grain = who["age"], fields["grain"]
     mottling = np.tensordot(_single(who["skin_noise"] / np.sqrt(SKIN_FIELDS)), fields["mottling"], 1)
     tone = 1.0 + (0.022 + 0.016 * age) * mottling + (0.010 + 0.012 * age) * grain
@@ -246,9 +243,8 @@ def _hair_thickness(shape: FaceShape, style: HairStyle, volume: float, distance:
 
 
 def paint_eyes(
-    albedo: Float32[ndarray, "3 rows columns"], parts: Int32[ndarray, "rows columns"], grid: FaceGrid,
-    who: Identity, lids: Float32[ndarray, "2 2"], gaze: Float32[ndarray, "2"],
-) -> None:  # fmt: skip
+    albedo: Albedo, parts: Parts, grid: FaceGrid, who: Identity, lids: Float32[ndarray, "2 2"], gaze: ndarray
+) -> None:
     """Paint one person's eyes in place. lids: how wide and how squinted the eye at p < 0 and that at p > 0
     are; gaze: face pixels."""
     rows, columns = np.abs(grid.q[:, 0] - head.EYE_Q) < 7.0, np.abs(np.abs(grid.p[0]) - head.EYE_P) < 8.0
@@ -283,9 +279,8 @@ def paint_eyes(
 
 
 def paint_mouth(
-    albedo: Float32[ndarray, "3 rows columns"], parts: Int32[ndarray, "rows columns"], grid: FaceGrid,
-    who: Identity, gap: Float32[ndarray, "columns"],
-) -> None:  # fmt: skip
+    albedo: Albedo, parts: Parts, grid: FaceGrid, who: Identity, gap: Float32[ndarray, "columns"]
+) -> None:
     """Paint one person's open mouth in place; ``gap`` is by how much the lips have parted, face pixels."""
     rows, columns = np.abs(grid.q[:, 0] - head.MOUTH_Q) < 1.1 * head.MOUTH_BAND, np.abs(grid.p[0]) < 9.3
     at = np.ix_(rows, columns)

@@ -3,8 +3,7 @@
 Each pixel takes 3 x 3 samples (offsets -1/3, 0, 1/3). The image is their mean, truth maps are the middle
 sample alone, at the pixel's centre. Normals, colours and charts are interpolated with perspective. Painted
 shapes (decals.py) are looked up at every sample: their edges are as sharp at 512 pixels as at 32. Unlike
-``derender.render`` this needs no gradient. Leaves out what is seen from behind. Numba's cache on disk refers
-to the named tuples by name: who renames one renames the kernels that take it.
+``derender.render`` this needs no gradient. Leaves out what is seen from behind. Renaming tuples: decals.py.
 """
 
 from functools import lru_cache
@@ -91,10 +90,8 @@ def _place(
     mesh: TriangleMesh, rotation: ndarray, translation: ndarray, focal_px: np.float32, size: int,
     light: Lighting,
 ) -> tuple[Float32[ndarray, "v 3"], Float32[ndarray, "v 8"]]:  # fmt: skip
-    """Column and row of a sample and 1 / z for each vertex; and normal, chart or colour, cosine to the light.
-
-    Normals, in the camera frame, are the mesh's own or means of its triangles'.
-    """
+    """Column and row of a sample and 1 / z for each vertex; and normal (the mesh's own or the mean of its
+    triangles'), chart or colour, cosine to the light."""
     camera = _turned(mesh.vertices, rotation) + translation
     camera[:, 2] += _ONE
     w = _ONE / camera[:, 2]
@@ -297,9 +294,7 @@ def _store(target, i, j, colour):
         target[n, i, j] = np.uint8(min(max(colour[n], _ZERO), _ONE) * np.float32(255.0) + np.float32(0.5))
 
 
-def _cast_shadows(
-    mesh: TriangleMesh, rotation: ndarray, translation: Float32[ndarray, "3"], light: Lighting
-) -> None:
+def _cast_shadows(mesh: TriangleMesh, rotation: ndarray, translation: ndarray, light: Lighting) -> None:
     """Fill in the shadow maps: how near to each lamp the nearest surface is, seen along its light."""
     points, size = mesh.vertices @ rotation.T, light.maps.shape[-1]
     scale = 0.48 * size / max(float(np.linalg.norm(points, axis=1).max()), 1e-6)

@@ -30,6 +30,7 @@ from derender.scene.light import light_direction
 from derender.storage.atomic import atomic_folder
 
 FOV_DEG = 10.0
+DEPTH_LOW, DEPTH_SPAN, EFFECT_SPAN = 0.8, 0.4, 2.0
 Row = dict[str, int | float | np.float32 | str]
 _LONGEST_RUN = 16
 _NOISE_CELLS = 5
@@ -130,10 +131,8 @@ def make_set(
     light, camera, identity, *tables = zip(*made, strict=True)
     labels, traits = ({name: np.array([row[name] for row in rows]) for name in rows[0]} for rows in tables)
     kept = {} if not effects.any else {name: maps.effects[:, n] for n, name in enumerate(EFFECTS)}
-    return SyntheticSet(
-        *maps[:-1], np.stack(light), np.stack(camera), np.array(identity), labels, traits, part_names,
-        effects=kept,
-    )  # fmt: skip
+    arrays = (*maps[:-1], np.stack(light), np.stack(camera), np.array(identity))
+    return SyntheticSet(*arrays, labels, traits, part_names, effects=kept)
 
 
 def draw_background(kind: str, generator: np.random.Generator, size: int) -> Float32[ndarray, "s s 3"]:
@@ -159,9 +158,6 @@ def draw_background(kind: str, generator: np.random.Generator, size: int) -> Flo
     near = np.maximum(np.float32(1.0) - apart, np.float32(0.0))
     share = near * near * (np.float32(3.0) - np.float32(2.0) * near)  # (size, cells)
     return share @ (share @ knots.reshape(_NOISE_CELLS, -1)).reshape(size, _NOISE_CELLS, 3)
-
-
-DEPTH_LOW, DEPTH_SPAN, EFFECT_SPAN = 0.8, 0.4, 2.0
 
 
 def write(
@@ -229,17 +225,14 @@ def _encoded(synthetic: SyntheticSet, i: int) -> dict[str, ndarray]:
 def _parameters(synthetic: SyntheticSet) -> dict[str, list[str]]:
     """The columns of params.csv; ``*_cam`` in the camera's frame, the others in the canonical one."""
     rotation, seen = camera_rotation_and_light(synthetic.camera, synthetic.light)
-    light = np.einsum("nji,nj->in", rotation, seen)
-    ambient, diffuse, *light_angles = synthetic.light.astype(float).T
-    angles = np.rad2deg(
-        [*light_angles, np.arctan2(seen[:, 1], seen[:, 2]), np.arctan2(seen[:, 0], seen[:, 2])]
-    )
+    (x, y, z), light = seen.T, np.einsum("nji,nj->in", rotation, seen)
+    ambient, diffuse, *angles = synthetic.light.astype(float).T
+    angles = np.rad2deg([*angles, np.arctan2(y, z), np.arctan2(x, z)])
     pitch, yaw, roll, tx, ty, _ = synthetic.camera.astype(float).T
     columns = {
         "ambient": ambient, "diffuse": diffuse, "light_pitch": angles[0], "light_yaw": angles[1],
         "lx": light[0], "ly": light[1], "lz": light[2],
-        "light_pitch_cam": angles[2], "light_yaw_cam": angles[3],
-        "lx_cam": seen[:, 0], "ly_cam": seen[:, 1], "lz_cam": seen[:, 2],
+        "light_pitch_cam": angles[2], "light_yaw_cam": angles[3], "lx_cam": x, "ly_cam": y, "lz_cam": z,
         "pitch": np.rad2deg(pitch), "yaw": np.rad2deg(yaw), "roll": np.rad2deg(roll), "tx": tx, "ty": ty,
     }  # fmt: skip
     labels = {name: _texts(values, 4) for name, values in synthetic.labels.items()}
