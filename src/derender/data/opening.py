@@ -73,6 +73,8 @@ def open_images(
     kind = _kind_of(path, place) if dataset == "auto" else dataset
     if kind not in STREAMED:
         return list_images(source, dataset=dataset, subset=subset, limit=limit)
+    if "half" in options:
+        raise ValueError(f"{source}: ?half= is for folders, zips and tables, not for what is read as a stream")
     if kind == "webdataset":
         if set(options) - {"column"}:
             raise ValueError(f"{source}: shards take ?column=NAME only")

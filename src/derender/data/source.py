@@ -26,7 +26,7 @@ from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from posixpath import basename, dirname
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -56,13 +56,16 @@ class Skipped:
     reason: str
 
 
+C = TypeVar("C", bound="Closing")
+
+
 class Closing:
     """What may hold files open until it is closed, or left as a context."""
 
     def close(self) -> None:
         """Release what is held open."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self: C) -> C:
         return self
 
     def __exit__(self, *exception: object) -> None:

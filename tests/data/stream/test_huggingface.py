@@ -107,6 +107,8 @@ def test_no_picture_column_and_several(rows, places):
     check(read_images("both.parquet?column=other", 9), 5)
     with pytest.raises(ValueError, match=r"no column of images 'photos'; did you mean 'photo'"):
         read_images("both.parquet?column=photos", 9)
+    with pytest.raises(ValueError, match=r"\?half= is for folders, zips and tables"):
+        read_images("both.parquet?half=test", 9)
 
 
 def test_rows_that_only_point_at_a_file_outside_are_not_followed(places, encoded):
