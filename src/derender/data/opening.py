@@ -74,7 +74,7 @@ def open_images(
     if kind not in STREAMED:
         return list_images(source, dataset=dataset, subset=subset, limit=limit)
     if "half" in options:
-        raise ValueError(f"{source}: ?half= is for folders, zips and tables, not for what is read as a stream")
+        raise ValueError(f"{source}: ?half= is for folders, zips and tables, not for streams")
     if kind == "webdataset":
         if set(options) - {"column"}:
             raise ValueError(f"{source}: shards take ?column=NAME only")
