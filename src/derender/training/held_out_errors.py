@@ -19,7 +19,7 @@ from derender.data import as_float
 from derender.model import load
 from derender.storage.atomic import write_whole
 from derender.storage.bounded import read_json
-from derender.storage.folder import QUANTILES, HeldOutErrors
+from derender.storage.folder import QUANTILES, HeldOutErrors, read_config
 from derender.storage.places import ERRORS_FILE, bundled_models, model_folder
 from derender.training.process import evaluating
 
@@ -118,10 +118,10 @@ def fitting_better(images: Images, besides: Collection[str] = ()) -> str:
     """The bundled model, ``besides`` some, that reconstructs images best; empty where none does it well."""
     results = []
     for name in set(bundled_models()).difference(besides):
-        known, model = read_errors(model_folder(name)), load(name)
-        if known is None or model.image_size != images.shape[-1]:
+        known, config = read_errors(folder := model_folder(name)), read_config(folder)
+        if known is None or config["settings"]["network"]["image_size"] != images.shape[-1]:
             continue
-        if np.median(explained_variance(model, images)) >= LEAST_EXPLAINED:
+        if np.median(explained_variance(model := load(name), images)) >= LEAST_EXPLAINED:
             results.append((float(np.median(reconstruction_percentile(model, images, known))), name))
     worse, best = min(results, default=(100.0, ""))
     if worse >= FITTING:
