@@ -2,8 +2,11 @@
 
 import gc
 import os
+from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -28,7 +31,7 @@ def shared_folder() -> Path | None:
     return folder if folder.is_dir() else None
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def shared_data():
     """``shared_data("data/utkface64.zip")`` gives the path, or skips the test and says what is missing."""
 
@@ -62,6 +65,17 @@ def smallest():
 def tiny(tmp_path_factory) -> Path:
     """The smallest model, saved."""
     return made_smallest().save(tmp_path_factory.mktemp("tiny") / "model")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _searched_once():
+    """The detector of faces gives its answer again for pixels that it has searched before."""
+    module = import_module("derender.photo.faces")
+    search = module._detected
+    detected = lru_cache(128)(lambda pixels, shape: search(np.frombuffer(pixels, np.uint8).reshape(shape)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_detected", lambda photo: list(detected(photo.tobytes(), photo.shape)))
+        yield
 
 
 @pytest.fixture(autouse=True)
