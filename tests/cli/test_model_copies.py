@@ -61,7 +61,7 @@ def test_features_hold_fitted_scenes_where_steps_are_set(folder, tmp_path, capsy
 @pytest.mark.parametrize("command", ["decompose", "rotate"])
 def test_images_are_made_of_fitted_scenes(fits, folder, tmp_path, command):
     given = [command, "-m", str(fits), str(folder / "000.png")]
-    extra = ["--film", "none"] if command == "rotate" else []
+    extra = ["--film", "none", "--stills", "2"] if command == "rotate" else []
     for name, steps in (("plain", []), ("fitted", ["--fit-steps", "12"])):
         assert main([*given, *extra, "-o", str(tmp_path / name), *steps]) == 0
     one, two = (sorted((tmp_path / name / "000").iterdir()) for name in ("plain", "fitted"))
@@ -95,7 +95,7 @@ def test_a_model_that_cannot_fit_is_told_how_to(folder, tmp_path, capsys):
 
 
 def test_a_refined_copy_comes_with_its_measurements(folder, tmp_path, numbers):
-    short = settings(*SHORT, "spatial=false", "steps=2", "fit_steps=10")
+    short = settings(*SHORT, "spatial=false", "directions=8", "examples=16", "steps=2", "fit_steps=10")
     told, shown = numbers("refine", folder, "-m", KNOWN, "-o", tmp_path / "mine", *short)
     assert told["pictures"] == 180 and told["held_out"] == 20
     assert told["errors"]["before"] > told["errors"]["fitted"] > 0

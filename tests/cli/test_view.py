@@ -101,19 +101,15 @@ def viewing(told: Path, *words: object) -> Iterator[str]:
     assert message.strip() == "stopped"
 
 
-def test_it_answers_until_ctrl_c(tiny, photos, tmp_path):
-    with viewing(tmp_path / "told.json", "-m", tiny, photos / "1.png") as url:
+def test_it_answers_until_ctrl_c_which_does_not_wait_for_a_running_fit(photos, tmp_path):
+    words = ("-m", "rendered-faces-64", photos / "1.png", "--fit-steps", 10_000)
+    with viewing(tmp_path / "told.json", *words) as url:
         with urllib.request.urlopen(url, timeout=60) as page:
             assert b"relight and turn a photograph" in page.read()
         foreign = urllib.request.Request(url, headers={"Host": "rebound.example"})
         with pytest.raises(urllib.error.HTTPError, match="421") as answer:
             urllib.request.urlopen(foreign, timeout=60)
         answer.value.close()
-
-
-def test_ctrl_c_does_not_wait_for_a_running_fit(photos, tmp_path):
-    words = ("-m", "rendered-faces-64", photos / "1.png", "--fit-steps", 10_000)
-    with viewing(tmp_path / "told.json", *words) as url:
         connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
         connection.request("POST", "/api/examples/0", headers={"X-Derender-Page": "1"})
         time.sleep(3)

@@ -116,10 +116,8 @@ def test_hollow_surfaces_are_inverted_where_a_resumed_run_inverts_them_too(pictu
     def until_64(watcher: Watcher, images: int, loss: float, latest: dict[str, float], *broken: str):
         return judge(watcher, images, loss, {**latest, "bulge": 0.2 if images > 64 else -0.5}, *broken)
 
-    judge, signs = (
-        Watcher.judge,
-        [dataclasses.replace(one, grace_images=0) for one in SIGNS if one.invert is not None],
-    )
+    judge = Watcher.judge
+    signs = [dataclasses.replace(one, grace_images=0) for one in SIGNS if one.invert is not None]
     monkeypatch.setattr(Watcher, "judge", until_64)
     monkeypatch.setattr(loop, "READ_EVERY_STEPS", 4)
     for name, value in {"PERSISTENCE_IMAGES": 40, "MEMORY_IMAGES": 8, "SIGNS": signs}.items():

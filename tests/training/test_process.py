@@ -11,6 +11,7 @@ import time
 import pytest
 import torch
 from PIL import Image
+from tests.trust.apart import start, waited
 
 from derender.data import read_images
 from derender.training import resolve, train
@@ -58,27 +59,25 @@ def test_freed_memory_is_reused_and_fabric_comes_without_torchmetrics_which_stay
     assert not kept or (outside > 1_000 and inside < outside / 4)  # the C library may have no mallopt
 
 
-HOLDS = """
-import sys, time
-from pathlib import Path
-from derender.training.process import locked
-with locked(Path(sys.argv[1])):
-    print("locked", flush=True)
-    time.sleep(600)
-"""
-
-
 @pytest.fixture
-def other(tmp_path):
+def other(tmp_path, tmp_path_factory):
     """A process that writes the run."""
-    process = subprocess.Popen([sys.executable, "-c", HOLDS, str(tmp_path / "run")], stdout=subprocess.PIPE)
-    assert process.stdout is not None and process.stdout.readline() == b"locked\n"
-    yield process
-    process.kill()
-    process.wait()
-    process.stdout.close()
+
+    def hold() -> None:
+        with locked(tmp_path / "run"):
+            (place / "held").touch()
+            time.sleep(600)
+
+    place = tmp_path_factory.mktemp("other")
+    child = start(hold, place / "log")
+    while not (place / "held").exists() and waited(child, 0.01) is None:
+        pass
+    yield child
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # while threads run
 def test_a_second_process_neither_writes_nor_trains_and_a_killed_one_is_taken_over(other, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(ValueError, match="run is being written by another process: wait for it"):
@@ -89,8 +88,8 @@ def test_a_second_process_neither_writes_nor_trains_and_a_killed_one_is_taken_ov
     with pytest.raises(ValueError, match="being written by another process"):
         train(resolve("small", ["image_size=32"]), images, run, resume=True)
     assert [file.name for file in run.iterdir()] == [LOCK_FILE]
-    other.send_signal(signal.SIGKILL)
-    other.wait()
+    os.kill(other, signal.SIGKILL)
+    assert waited(other, 60) == -signal.SIGKILL
     (run / "config.yaml").touch()
     with locked(run), locked(run):
         assert (run / LOCK_FILE).exists()

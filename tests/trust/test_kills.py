@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import warnings
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.trust.apart import start, waited
 
 from derender.storage import atomic
 from derender.storage.atomic import CHECKSUMS, Damaged, DamageNoticed, atomic_folder, check_seal, seal
@@ -55,11 +55,8 @@ def run(net, tmp_path) -> Path:
 
 def killed_at(step: int, work) -> bool:
     """Do the work in a process that is gone just before its ``step``-th touch of a file; whether it was."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of forks while threads run
-        child = os.fork()
-    if not child:
-        signal.alarm(20)
+
+    def until_then() -> int:
         touched = 0
 
         def count(event: str, _: tuple[object, ...]) -> None:
@@ -69,15 +66,15 @@ def killed_at(step: int, work) -> bool:
                 os._exit(9)
 
         sys.addaudithook(count)
-        try:
-            work()
-        finally:
-            os._exit(0)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        work()
+        os._exit(0)
+
+    code = waited(start(until_then, Path(os.devnull)), 20)
     assert code in (0, 9)
     return code == 9
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # while threads run
 @pytest.mark.parametrize("exchange", [True, False])
 def test_a_kill_at_any_step_of_writing_a_checkpoint_leaves_a_whole_one(
     net, run, tmp_path, monkeypatch, exchange

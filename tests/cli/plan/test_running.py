@@ -1,16 +1,18 @@
 """A plan from file to tables: what it leaves, kill -9 in the middle, jobs that fail."""
 
 import json
+import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import torch
 from filelock import FileLock
 from tests.cli.conftest import coloured_people
+from tests.trust.apart import start, waited
 
 from derender.cli import main
+from derender.training import loop
 
 PLAN = """
 images: 64
@@ -28,21 +30,6 @@ counts: [8]
 draws: 1
 untrained_seeds: 1
 resamples: 10
-"""
-KILLED = """
-import os, signal, sys
-from derender.cli import main
-from derender.training import loop
-
-kept = loop._Run.checkpoint
-
-def killed(run):
-    kept(run)
-    if run.state.images == 32:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-loop._Run.checkpoint = killed
-main(sys.argv[1:])
 """
 
 
@@ -117,13 +104,21 @@ def test_jobs_whose_inputs_changed_are_done_again(plan, whole, numbers, tmp_path
         assert set(again) <= set(todo) and ("embed hog of people" not in todo), (old, todo)
 
 
-def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole):
-    out = plan.parent / "killed"
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # while threads run
+def test_killed_in_the_middle_it_ends_with_the_very_table(plan, whole, tmp_path, monkeypatch):
+    def killed(run: loop._Run) -> None:
+        kept(run)
+        if run.state.images == 32:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    kept, out = loop._Run.checkpoint, plan.parent / "killed"
     out.mkdir()
     (out / ".plan.yaml-left").write_text("")  # by a kill at the very beginning
     words = ["compare", "--plan", str(plan), "--out", str(out)]
-    done = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, timeout=250)
-    assert done.returncode == -signal.SIGKILL
+    with monkeypatch.context() as patch:
+        patch.setattr(loop._Run, "checkpoint", killed)
+        child = start(lambda: torch.set_num_threads(1) or main(words), tmp_path / "log")
+    assert waited(child, 250) == -signal.SIGKILL
     assert (out / "runs" / "colours" / "ae" / "checkpoints" / "last").is_dir()
     assert not (out / "comparison.json").exists()
     assert main(words) == 0
