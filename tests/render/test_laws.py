@@ -172,7 +172,7 @@ def test_images_of_a_batch_do_not_mix(backend, generator):
 
 
 def test_gradcheck_of_render(backend, generator):
-    values = scene(1, 5, 6, generator, torch.float64, turn_rad=0.3)
+    values = scene(1, 4, 5, generator, torch.float64, turn_rad=0.3)
     inputs = tuple(value.requires_grad_() for value in values)
 
     def outputs(*parts: Tensor) -> tuple[Tensor, Tensor]:

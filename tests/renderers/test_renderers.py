@@ -42,7 +42,7 @@ def scene_for(name: str, generator, count: int = 2, side: int = 16, dtype=torch.
 
 @pytest.mark.parametrize("name", ALL)
 def test_gradients_of_every_parameter_are_those_of_finite_differences(name, generator):
-    given, renderer = scene_for(name, generator, 1, 7), renderer_named(name)
+    given, renderer = scene_for(name, generator, 1, 5), renderer_named(name)
     names, values = zip(*given.parameters.items(), strict=True)
 
     def image(*changed: Tensor) -> Tensor:

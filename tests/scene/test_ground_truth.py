@@ -19,7 +19,7 @@ from derender.scene.normals import normals_from_depth
 COUNT = 64
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def truth(shared_data) -> GroundTruth:
     return read_ground_truth(shared_data("data/synface64.zip"), limit=COUNT)
 
