@@ -82,4 +82,5 @@ def _searched_once():
 def _restore_determinism():
     """A run with ``deterministic=true`` leaves torch as it was."""
     yield
-    torch.use_deterministic_algorithms(False)
+    if torch.are_deterministic_algorithms_enabled():  # else the call would only import torch's compiler
+        torch.use_deterministic_algorithms(False)

@@ -205,13 +205,13 @@ def test_a_name_that_is_no_utf8(tiny, photos, tmp_path, numbers):
     shutil.copy(photos / "0.png", odd)
     for command in ("decompose", "relight"):
         words = (command, "-m", tiny, os.fsdecode(odd), "-o", tmp_path / command)
-        told, _ = numbers(*words, *(["--film", "none"] if command == "relight" else []))
+        told, _ = numbers(*words, *(["--film", "none", "--stills", 2] if command == "relight" else []))
         assert told["pictures"][0]["picture"] == os.fsdecode(odd)
 
 
 def test_two_processes_do_not_write_to_one_folder(tiny, photos, tmp_path, refused):
     out = tmp_path / "out"
-    words = ("mesh", "-m", tiny, photos / "0.png", "-o", out)
+    words = ("mesh", "-m", tiny, photos / "0.png", "--size", 32, "-o", out)
     (out / ".sheet").mkdir(parents=True)
     with FileLock(out / ".sheet" / LOCK_FILE):
         assert "is being written by another process" in refused(*words)
