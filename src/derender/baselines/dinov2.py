@@ -70,8 +70,9 @@ class Dinov2(base.BaselineModel):
             tree, _ = library.PretrainedConfig.get_config_dict(source, local_files_only=True)
             if tree.get("model_type") != "dinov2":
                 raise ValueError(f"{source} is a {tree.get('model_type')}, expected a dinov2")
-            how = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
-            net, info = library.Dinov2Model.from_pretrained(source, **how)
+            net, info = library.Dinov2Model.from_pretrained(
+                source, local_files_only=True, use_safetensors=True, output_loading_info=True
+            )
         except OSError as error:
             why = "are not in the Hugging Face cache or cannot be read, and nothing is downloaded here"
             fix = f"run 'hf download {source}' once where there is a network, or name their folder"

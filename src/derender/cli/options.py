@@ -105,7 +105,8 @@ class Output:
             if path.is_dir() and not folder:
                 raise IsADirectoryError(f"{path} is a folder: name a file to write")
             if path.exists() and not (self.force or force):
-                raise FileExistsError(f"{path} exists already: choose another name, or add --force")
+                fix = "choose another name, or add --force to replace it"
+                raise FileExistsError(f"{path} exists already: {fix}")
 
     def result(self, text: str) -> None:
         """Print one line of result."""

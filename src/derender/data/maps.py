@@ -76,9 +76,9 @@ def read_masks(
 
     Args:
         masks: a folder or zip with a mask for every image: that of ``a/b.jpg`` is ``a/b.png``, or the only
-            ``b.png`` there is. A file ``classes.txt`` among them, or beside their folder as `derender synth`
-            writes it, names the classes, one a line from number 0 on; else they have their numbers. None
-            takes the data set's own masks, with CelebAMask-HQ's classes and the aspect ratio of their images.
+            ``b.png`` there is. A file ``classes.txt`` names the classes, one a line from number 0 on; it lies
+            among them, or beside their folder. Without it classes have their numbers. None takes the data
+            set's own masks, with CelebAMask-HQ's classes and the aspect ratio of their images.
     """
     own = masks is None
     with ExitStack() as opened:

@@ -134,8 +134,9 @@ class _Copying:
         self, made: Derenderer, scores: dict[str, Any], held_out: Tensor | None = None, *,
         same_weights: bool = False,
     ) -> ModelCopy:  # fmt: skip
-        """Save the copy, with the original's split unless other images were seen, and with the errors of
-        ``held_out`` images, of the ``same_weights`` those of the original. Complete or not at all.
+        """Save the copy, complete or not at all, with the original's split unless other images were seen.
+
+        Its errors are those of ``held_out`` images; with the ``same_weights`` they are the original's.
         """
         with new_folder(self.out, overwrite=self.overwrite) as folder:
             made.write(folder)

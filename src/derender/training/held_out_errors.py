@@ -103,7 +103,7 @@ def unlike(images: Images, percentiles: Sequence[float] | np.ndarray) -> str:
     """What images that a model reconstructs badly have in common: their number, and the model that fits.
 
     One line of all images (N, 3, S, S), by the ``percentiles`` of their errors among the model's held-out
-    ones; empty where no more of them are out-of-distribution than among held-out ones.
+    ones. It is empty where no more of them are out-of-distribution than among those.
     """
     odd = np.flatnonzero(np.asarray(percentiles) > OUTLIER_PERCENTILE)
     if len(odd) <= EXPECTED_OUTLIERS * len(percentiles):

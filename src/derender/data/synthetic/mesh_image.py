@@ -90,8 +90,7 @@ def _place(
     mesh: TriangleMesh, rotation: ndarray, translation: ndarray, focal_px: np.float32, size: int,
     light: Lighting,
 ) -> tuple[Float32[ndarray, "v 3"], Float32[ndarray, "v 8"]]:  # fmt: skip
-    """Column and row of a sample and 1 / z for each vertex; and normal (the mesh's own or the mean of its
-    triangles'), chart or colour, cosine to the light."""
+    """Column and row of a sample, 1 / z; and normal, chart or colour, cosine to the light; by vertex."""
     camera = _turned(mesh.vertices, rotation) + translation
     camera[:, 2] += _ONE
     w = _ONE / camera[:, 2]
