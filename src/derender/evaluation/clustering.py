@@ -162,16 +162,13 @@ def _numbered(values: np.ndarray, name: str) -> np.ndarray:
     """Classes as integers from 0, -1 where missing."""
     classes = measures.encoded(values)
     known, count = int((classes >= 0).sum()), int(classes.max(initial=-1)) + 1
+    rows = f"{known} labelled rows of {name!r}"
     if count < 2:
-        raise ValueError(
-            f"clustering needs at least two classes, the {known} labelled rows of {name!r} have {count}: "
-            "choose another label column"
-        )
+        what = f"clustering needs at least two classes, the {rows} have {count}"
+        raise ValueError(f"{what}: choose another label column")
     if count == known:
-        raise ValueError(
-            f"every one of the {known} labelled rows of {name!r} is a class of its own: choose a label "
-            "column whose values repeat"
-        )
+        fix = "choose a label column whose values repeat"
+        raise ValueError(f"every one of the {rows} is a class of its own: {fix}")
     return classes
 
 

@@ -34,8 +34,7 @@ from derender.features import named
 
 FLOAT64_ROWS = 20_000  # above, nearest neighbours are looked up in float32; heights are always float64
 NUMBERS_AT_ONCE = 1 << 20
-LEAVES = 16_384
-"""Clusters that the cells leave; more cannot be asked for."""
+LEAVES = 16_384  # clusters that the cells leave; more cannot be asked for
 
 
 def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
@@ -73,13 +72,11 @@ def ward_tree(features: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarr
         done += len(first)
         if done == count - 1:
             return _in_order(np.concatenate(merges), count)
-        touched = np.zeros(len(means), bool)
-        touched[first] = touched[second] = True
+        touched = np.isin(places, (first, second))
         stale = np.flatnonzero((touched | touched[nearest]) & (sizes > 0))
         if (sizes == 0).mean() > 0.1:  # rows that were merged away are removed
-            kept = np.flatnonzero(sizes > 0)
-            place = np.zeros(len(means), np.int64)
-            place[kept] = np.arange(len(kept))
+            kept = sizes > 0
+            place = np.cumsum(kept) - 1
             means, sizes, cluster, height = means[kept], sizes[kept], cluster[kept], height[kept]
             nearest, distance, stale = place[nearest[kept]], distance[kept], place[stale]
 
@@ -165,8 +162,7 @@ def _in_order(merges: np.ndarray, count: int) -> np.ndarray:
     return tree
 
 
-METHODS = {"ward": "Ward clustering", "finch": "FINCH clustering", "k-means": "k-means"}
-"""By name, as tables call it."""
+METHODS = {"ward": "Ward clustering", "finch": "FINCH clustering", "k-means": "k-means"}  # as in tables
 _MINI_BATCH = 16_384
 
 
@@ -208,17 +204,16 @@ def clusterings(
     """
     memory, wanted = memory or Memory(), sorted(set(counts))
     features = neighbours.finite_rows(features, "clustering")
+    rows = len(features)
     named(METHODS, method, "method")
     for count in wanted:
-        if not 1 <= count <= len(features):
-            raise ValueError(
-                f"cannot make {count} clusters of {len(features)} rows: ask for 1 to {len(features)}"
-            )
+        if not 1 <= count <= rows:
+            raise ValueError(f"cannot make {count} clusters of {rows} rows: ask for 1 to {rows}")
     inputs = {"features": features}
     if method == "finch":
         hierarchy = finch(features, memory)
         return {count: finch_clusters(features, count, hierarchy) for count in wanted}
-    if method == "ward" and len(features) > neighbours.EXACT_ROWS:
+    if method == "ward" and rows > neighbours.EXACT_ROWS:
         result = memory.recall("ward-cells", inputs, lambda: ward_in_cells(features))
         return {count: cut(n_clusters=count, **result) for count in wanted}
     if method == "ward":
@@ -229,8 +224,8 @@ def clusterings(
         from sklearn.cluster import KMeans, MiniBatchKMeans
 
         how: dict[str, Any] = {"n_clusters": count, "n_init": 10, "random_state": seed}
-        many = len(features) > neighbours.EXACT_ROWS
-        means = MiniBatchKMeans(batch_size=_MINI_BATCH, **how) if many else KMeans(**how)
+        exact = rows <= neighbours.EXACT_ROWS
+        means = KMeans(**how) if exact else MiniBatchKMeans(batch_size=_MINI_BATCH, **how)
         return np.asarray(means.fit(features.astype(np.float32, copy=False)).labels_, np.int64)
 
     keys = {count: {**inputs, "seed": seed, "clusters": count} for count in wanted}
@@ -267,11 +262,9 @@ def finch_clusters(
     """
     features = neighbours.finite_rows(features, "FINCH")
     hierarchy = hierarchy or finch(features)
-    if not 1 <= n_clusters <= hierarchy.counts[0]:
-        raise ValueError(
-            f"FINCH's finest partition of {len(features)} rows has {hierarchy.counts[0]} clusters, "
-            f"cannot make {n_clusters}: ask for 1 to {hierarchy.counts[0]}, or use Ward"
-        )
+    if not 1 <= n_clusters <= (most := hierarchy.counts[0]):
+        what = f"FINCH's finest partition of {len(features)} rows has {most} clusters"
+        raise ValueError(f"{what}, cannot make {n_clusters}: ask for 1 to {most}, or use Ward")
     partition = [part for part in hierarchy.partitions if part.max() + 1 >= n_clusters][-1]
     means, sizes = _means(features, partition), np.bincount(partition)
     while len(means) > n_clusters:

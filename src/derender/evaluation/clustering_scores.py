@@ -19,8 +19,7 @@ SEEDS = tuple(range(10))
 
 Metric = Callable[[np.ndarray], np.ndarray]
 """(B,) scores of (B, classes, clusters) numbers of rows; each of the B tables has at least one."""
-METRICS: dict[str, Metric] = {}
-"""By name. Every score is best at 1."""
+METRICS: dict[str, Metric] = {}  # by name; every score is best at 1
 CLUSTER_COLUMNS: dict[str, Column] = {}
 
 

@@ -24,9 +24,7 @@ from derender.storage.atomic import DamageNoticed, atomic_file
 
 T = TypeVar("T")
 Arrays = dict[str, np.ndarray]
-NAMES = "names of all arrays"
-"""Stands beside the arrays in a file: one that a damaged directory of the zip hides is missed."""
-
+NAMES = "names of all arrays"  # stand beside them: one that a damaged directory of the zip hides is missed
 _DAMAGED = (OSError, ValueError, EOFError, LookupError, RuntimeError, BadZipFile, zlib.error, struct.error)
 
 

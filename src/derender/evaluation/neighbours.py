@@ -21,14 +21,9 @@ from derender.data import usable_cores
 
 T = TypeVar("T")
 NUMBERS_AT_ONCE = 1 << 23
-
-EXACT_ROWS = 100_000
-"""Up to so many rows all pairs are looked at."""
-
+EXACT_ROWS = 100_000  # up to so many rows all pairs are looked at
 NEAR_CELLS = 4
-
-CELL_ROWS = 2_000
-"""Rows that a cell is to have; none has more than four times as many."""
+CELL_ROWS = 2_000  # rows that a cell is to have; none has more than four times as many
 
 
 def finite_rows(features: np.ndarray, purpose: str) -> np.ndarray:
@@ -38,10 +33,8 @@ def finite_rows(features: np.ndarray, purpose: str) -> np.ndarray:
     if features.ndim != 2:
         raise ValueError(f"features must be (rows, dimensions), got shape {features.shape}")
     if not np.isfinite(features).all():
-        bad = int((~np.isfinite(features).all(axis=1)).sum())
-        raise ValueError(
-            f"features are not finite in {bad} of {len(features)} rows: drop these rows or check the model"
-        )
+        bad = f"{int((~np.isfinite(features).all(axis=1)).sum())} of {len(features)} rows"
+        raise ValueError(f"features are not finite in {bad}: drop these rows or check the model")
     if len(features) < 2:
         raise ValueError(f"{purpose} takes 2 rows or more, got {len(features)}")
     return features
