@@ -31,8 +31,7 @@ from derender.storage.bounded import first_line
 from derender.storage.folder import CONFIG_FILE, saved_config
 
 ModelSource = Derenderer | str | Path
-FeatureSource = FeatureTable | ModelSource
-"""A table or its ``.parquet`` file; a model or its name, or a baseline's run folder."""
+FeatureSource = FeatureTable | ModelSource  # also a table's .parquet file, a name, a baseline's run folder
 UNTRAINED = "untrained encoder"
 DESCRIPTORS_SHOWN = {"gradientfaces": "Gradientfaces", "hog": "HOG", "lbp": "LBP"}
 
@@ -181,9 +180,8 @@ def prepare(
 
     table = averaged(first)
     if differing := [name for name in labels if name not in table.labels]:
-        raise ValueError(
-            f"label {differing[0]!r} differs inside groups of {', '.join(mean_by)}: average by it too"
-        )
+        groups = f"groups of {', '.join(mean_by)}"
+        raise ValueError(f"label {differing[0]!r} differs inside {groups}: average by it too")
     kept = np.arange(len(table))
     if min_count > 1 or max_count is not None:
         if len(labels) != 1:
@@ -218,12 +216,9 @@ def at_least(labels: np.ndarray, count: int, most: int | None = None) -> np.ndar
 def check_lengths(features: Mapping[str, Sequence[np.ndarray]], n_rows: int) -> None:
     """Every array of features has as many rows as there are labels."""
     for name, arrays in features.items():
-        for array in arrays:
-            if len(array) != n_rows:
-                raise ValueError(
-                    f"features {name!r} have {len(array)} rows, the labels {n_rows}: all features of one "
-                    "table must be of the same images"
-                )
+        if other := [len(array) for array in arrays if len(array) != n_rows]:
+            fix = "all features of one table must be of the same images"
+            raise ValueError(f"features {name!r} have {other[0]} rows, the labels {n_rows}: {fix}")
 
 
 def check_rows(rows: Sequence[FeatureRow]) -> None:
@@ -233,25 +228,20 @@ def check_rows(rows: Sequence[FeatureRow]) -> None:
     names = [row.name for row in rows]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"two rows have the name {twice[0]!r}: give each its own")
-    first = rows[0].tables[0]
+    first, fix = rows[0].tables[0], "embed the same data for each"
     for row in rows:
         for table in row.tables:
             if len(first) != len(table):
-                raise ValueError(
-                    f"features {names[0]!r} have {len(first)} rows and {row.name!r} {len(table)}: one table "
-                    "compares features of the same images; embed the same data for each"
-                )
+                what = f"features {names[0]!r} have {len(first)} rows and {row.name!r} {len(table)}"
+                raise ValueError(f"{what}: one table compares features of the same images; {fix}")
             if other := [pair for pair in zip(first.files, table.files, strict=True) if pair[0] != pair[1]]:
-                raise ValueError(
-                    f"features {names[0]!r} and {row.name!r} are of different images, in {len(other)} of "
-                    f"{len(first)} rows ({other[0][0]} and {other[0][1]}): embed the same data for each"
-                )
+                what = f"features {names[0]!r} and {row.name!r} are of different images"
+                where = f"in {len(other)} of {len(first)} rows ({other[0][0]} and {other[0][1]})"
+                raise ValueError(f"{what}, {where}: {fix}")
             if _made_by(table) != _made_by(row.tables[0]):
-                raise ValueError(
-                    f"row {row.name!r} mixes features of different models (another kind, factors, sizes or "
-                    "settings): several tables of one name are runs of the same model; give each model its "
-                    "own name"
-                )
+                what = f"row {row.name!r} mixes features of different models"
+                rule = "several tables of one name are runs of the same model; give each model its own name"
+                raise ValueError(f"{what} (another kind, factors, sizes or settings): {rule}")
 
 
 def _made_by(table: FeatureTable) -> list[Any]:
@@ -332,8 +322,6 @@ def architecture(rows: Sequence[FeatureRow]) -> ModelSettings | None:
             try:
                 return ModelSettings.model_validate(stored)
             except ValueError as error:
-                raise ValueError(
-                    f"features {row.name!r} were made by a model this version does not know "
-                    f"({first_line(error)}): embed the data again"
-                ) from error
+                what = f"features {row.name!r} were made by a model this version does not know"
+                raise ValueError(f"{what} ({first_line(error)}): embed the data again") from error
     return None

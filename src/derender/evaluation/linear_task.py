@@ -59,10 +59,8 @@ def task_of(labels: Mapping[str, np.ndarray]) -> Task:
         return Task("labels", tuple(columns), targets.astype(np.int8))
     values, numbers = columns[many[0]]
     if len(columns) > 1:
-        raise ValueError(
-            f"label {many[0]!r} has {len(values)} classes and cannot be asked together with others: name it "
-            "alone, or only labels of two values"
-        )
+        what = f"label {many[0]!r} has {len(values)} classes and cannot be asked together with others"
+        raise ValueError(f"{what}: name it alone, or only labels of two values")
     targets = (numbers[:, None] == np.arange(len(values))).astype(np.int8)
     targets[numbers < 0] = -1
     return Task("classes", tuple(map(str, values)), targets)
@@ -80,10 +78,9 @@ def choose_rows(
     if not len(seeds):
         raise ValueError("a linear probe needs at least one seed")
     if not len(counts) or min(counts) < 2 or max(counts) > len(pool) or len(test) < 2:
-        raise ValueError(
-            f"asked to learn from {', '.join(map(str, counts)) or 'no'} labelled rows: {len(pool)} can be "
-            f"learned from and {len(test)} are tested; counts must lie in 2..{len(pool)}"
-        )
+        have = f"{len(pool)} can be learned from and {len(test)} are tested"
+        asked = f"{', '.join(map(str, counts)) or 'no'} labelled rows"
+        raise ValueError(f"asked to learn from {asked}: {have}; counts must lie in 2..{len(pool)}")
     orders = [np.random.default_rng(seed).permutation(pool) for seed in seeds]
     return Rows(test, {count: np.stack([order[:count] for order in orders]) for count in counts})
 
@@ -113,10 +110,9 @@ def divide_rows(
     if groups is not None and task.kind == "classes" and len(learn) and len(test):
         shown, asked = (np.any(task.targets[rows] > 0, axis=0) for rows in (learn, test))
         if not (shown & asked).any():
-            raise ValueError(
-                f"none of the {int(asked.sum())} classes tested is learned from: rows of a group stay on "
-                "one side, and these groups hold whole classes; choose other --groups, or none"
-            )
+            why = "rows of a group stay on one side, and these groups hold whole classes"
+            what = f"none of the {int(asked.sum())} classes tested is learned from"
+            raise ValueError(f"{what}: {why}; choose other --groups, or none")
     return learn, test
 
 
@@ -125,16 +121,12 @@ def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
     known, numbers = ~missing(values), np.full(len(values), -1, np.int64)
     distinct, numbers[known], counts = np.unique(values[known], return_inverse=True, return_counts=True)
     if len(distinct) < 2:
-        raise ValueError(
-            f"a linear probe needs at least two classes, the {int(known.sum())} labelled rows of {name!r} "
-            f"have {len(distinct)}: choose another label column"
-        )
+        have = f"the {int(known.sum())} labelled rows of {name!r} have {len(distinct)}"
+        raise ValueError(f"a linear probe needs at least two classes, {have}: choose another label column")
     if counts.min() < 2:
-        raise ValueError(
-            f"class {distinct.tolist()[counts.argmin()]!r} of label {name!r} has one row, which cannot be "
-            "both learned and tested: leave this class out (where there is --min-count, give 2), or choose "
-            "another label"
-        )
+        what = f"class {distinct.tolist()[counts.argmin()]!r} of label {name!r} has one row"
+        fix = "leave this class out (where there is --min-count, give 2), or choose another label"
+        raise ValueError(f"{what}, which cannot be both learned and tested: {fix}")
     return distinct.tolist(), numbers
 
 

@@ -14,10 +14,8 @@ from derender.evaluation.memory import Memory, memory_in
 from derender.inputs import Progress, as_images
 
 DEFAULT_FACTORS = ("geometry", "albedo")
-NAMED = 5
-"""So many skipped images are named."""
-FORMER = {"resample_count": "resamples", "memory": "cache"}
-"""Former keywords of some protocols, which are taken still, and today's."""
+NAMED = 5  # so many skipped images are named
+FORMER = {"resample_count": "resamples", "memory": "cache"}  # former keywords, taken still, and today's
 
 
 @dataclass(frozen=True)
@@ -96,11 +94,9 @@ class Options:
             assert self.images is not None
             how = {name: getattr(self, name) for name in ("dataset", "limit", "keep_duplicates")}
             result = as_images(self.images, image_size, **how, progress=self.stage("reading"))
-            if result.images.shape[-1] != image_size:
-                raise ValueError(
-                    f"the images have {result.images.shape[-1]} pixels a side and {image_size} are needed: "
-                    "give the address of the data set instead"
-                )
+            if (side := result.images.shape[-1]) != image_size:
+                fix = "give the address of the data set instead"
+                raise ValueError(f"the images have {side} pixels a side and {image_size} are needed: {fix}")
             self.notes.append(result.describe())
             self.notes.extend(f"skipped {row.file}: {row.reason}" for row in result.skipped[:NAMED])
             if len(result.skipped) > NAMED:
@@ -115,10 +111,8 @@ def aligned(images: ImageSet, files: Sequence[str]) -> ImageSet:
     if images.files == tuple(files):
         return images
     place = {file: row for row, file in enumerate(images.files)}
-    absent = [file for file in files if file not in place]
-    if absent:
-        raise ValueError(
-            f"{len(absent)} of {len(files)} rows of the table are not among the images of "
-            f"{images.source} (first {absent[0]}): give the data that the table was made from"
-        )
+    if absent := [file for file in files if file not in place]:
+        among = f"the images of {images.source} (first {absent[0]})"
+        what = f"{len(absent)} of {len(files)} rows of the table are not among {among}"
+        raise ValueError(f"{what}: give the data that the table was made from")
     return images.select(np.array([place[file] for file in files]))

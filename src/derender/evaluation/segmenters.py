@@ -32,6 +32,8 @@ from derender.settings import Settings
 from derender.training.process import freed_memory_kept
 
 TEST_FRACTION = 0.2
+LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
+LEVELS_KEPT = 2  # finest first, whose BatchNorm keeps its statistics beside a learnt decoder
 _CHUNK = 512
 
 
@@ -83,30 +85,20 @@ def divide(
         split = split_indices(images.files, (1 - test_fraction, 0.0, test_fraction), seed=split_seed)
         train, test, rule = split.train, split.test, f"a hash of the files' names, seed {split_seed}"
     if len(train) < 2 or not len(test):
-        raise ValueError(
-            f"{images.source} leaves {len(train)} images to learn from and {len(test)} to test on: "
-            "bring more images, or another test_fraction"
-        )
+        what = f"{images.source} leaves {len(train)} images to learn from and {len(test)} to test on"
+        raise ValueError(f"{what}: bring more images, or another test_fraction")
     if labelled is not None:
         if not 2 <= labelled <= len(train):
-            raise ValueError(
-                f"labelled={labelled:,} training images, but there are {len(train):,}: choose 2 to that many"
-            )
+            what = f"labelled={labelled:,} training images, but there are {len(train):,}"
+            raise ValueError(f"{what}: choose 2 to that many")
         train = np.sort(np.random.default_rng(split_seed).permutation(train)[:labelled])
     seen = np.unique(masks[train])
     if len(seen) < 2:
-        raise ValueError(
-            f"the {len(train):,} masks to learn from in {images.source} show one class only "
-            f"({classes[int(seen[0])]}): segmentation needs two or more"
-        )
+        where, only = f"masks to learn from in {images.source}", classes[int(seen[0])]
+        what = f"the {len(train):,} {where} show one class only ({only})"
+        raise ValueError(f"{what}: segmentation needs two or more")
     about = (rule, images.source, images.layout)
     return SegmentationData(images.images, masks, tuple(classes), train, test, *about)
-
-
-LARGEST_BATCH, SMALLEST_BATCH, STEPS_AN_EPOCH = 64, 2, 320
-
-LEVELS_KEPT = 2
-"""Levels, finest first, whose BatchNorm keeps its statistics in encoders and a decoder trained together."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +116,7 @@ class Variant:
 
 
 _ONE, _BOTH = ("geometry",), ("geometry", "albedo")
-VARIANTS: Mapping[str, Variant] = {
+VARIANTS: Mapping[str, Variant] = {  # by name on the command line
     "joint-whole": Variant("joint, decoder too", _BOTH, True, False, decoder=True),
     "joint": Variant("joint encoders", _BOTH, True, False),
     "geometry": Variant("geometry encoder", _ONE, True, False),
@@ -133,7 +125,6 @@ VARIANTS: Mapping[str, Variant] = {
     "random": Variant("random start", _ONE, False, False),
     "joint-random": Variant("random start, joint", _BOTH, False, False),
 }
-"""By name on the command line."""
 
 
 class SegmentSettings(Settings):
@@ -162,10 +153,9 @@ def chosen_variants(model: Any, names: Sequence[str] | None = None) -> dict[str,
     for factor in sorted({factor for variant in variants.values() for factor in variant.factors}):
         encoder = getattr(model.nets[factor], "encoder", None) if factor in model.nets else None
         if not isinstance(encoder, UNetEncoder):
-            raise ValueError(
-                f"the model has no U-Net encoder for {factor}, and segmentation needs its skip features: "
-                "make one with derender unet, or train one with derender train --set encoder=unet"
-            )
+            what = f"the model has no U-Net encoder for {factor}, and segmentation needs its skip features"
+            fix = "make one with derender unet, or train one with derender train --set encoder=unet"
+            raise ValueError(f"{what}: {fix}")
     if any(variant.decoder for variant in variants.values()) and not own_decoder:
         raise ValueError("the model has no U-Net decoder: make a copy that has with derender unet")
     return variants
@@ -188,7 +178,9 @@ class SegmentationNet(nn.Module):
         decoder: UNetDecoder | None = None,
     ):
         super().__init__()
-        self.encoders = nn.ModuleList(encoders).requires_grad_(not frozen)
+        self.frozen, self.encoders = frozen, nn.ModuleList(encoders).requires_grad_(not frozen)
+        # parts whose BatchNorm keeps its statistics
+        self._fixed: list[nn.Module] = [self.encoders] if frozen or kept_statistics else []
         for encoder in encoders:
             encoder.to_code.requires_grad_(False)  # the code takes no part here
         if decoder is None:
@@ -197,10 +189,6 @@ class SegmentationNet(nn.Module):
             self.decoder = copy.deepcopy(decoder).requires_grad_(True)
             last = decoder.to_outputs
             self.decoder.to_outputs = nn.Conv2d(last.in_channels, outputs, 1, device=last.weight.device)
-        self.frozen = frozen
-        # parts whose BatchNorm keeps its statistics
-        self._fixed: list[nn.Module] = [self.encoders] if frozen or kept_statistics else []
-        if decoder is not None:
             levels = [encoder.levels[:LEVELS_KEPT] for encoder in encoders]
             self._fixed = [*levels, self.decoder.convolve[-LEVELS_KEPT:]]
 
@@ -317,8 +305,7 @@ def by_components(data: SegmentationData) -> np.ndarray:
     return best.reshape(len(best), *data.masks.shape[1:])
 
 
-CONTROLS: Mapping[str, Callable[[SegmentationData], np.ndarray]] = {
+CONTROLS: Mapping[str, Callable[[SegmentationData], np.ndarray]] = {  # by row name
     "each place's class": most_frequent_at_place,
     "PCA": by_components,
 }
-"""By row name."""

@@ -34,8 +34,7 @@ from derender.scene import Scene
 from derender.training.step import fill_uncovered
 
 LEVELS = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
-LABELS = {"faces": "identity", "cars": "class"}
-"""The question by kind of generated images."""
+LABELS = {"faces": "identity", "cars": "class"}  # the question by kind of generated images
 _OBJECTS = {"faces": "identity", "cars": "model"}  # as the settings of their generators call them
 
 
@@ -71,10 +70,9 @@ class Axis:
     def true_deg(self, labels: Mapping[str, np.ndarray]) -> np.ndarray:
         """(N,) angles off the front by the labels, in degrees, 0 or more; without these labels an error."""
         if absent := [name for name in self.truth if name not in labels]:
-            raise ValueError(
-                f"the true {self.title} is not among the labels (there is no {absent[0]!r}): give rendered "
-                "images with a params.csv, as derender synth writes them"
-            )
+            what = f"the true {self.title} is not among the labels (there is no {absent[0]!r})"
+            fix = "give rendered images with a params.csv, as derender synth writes them"
+            raise ValueError(f"{what}: {fix}")
         angles = [np.asarray(labels[name], np.float64) for name in self.truth]
         if len(angles) == 1:
             return np.degrees(np.abs(angles[0]))
@@ -82,7 +80,7 @@ class Axis:
 
 
 _PITCH, _YAW = {"faces": "pitch_deg", "cars": "pitch_deg"}, {"faces": "yaw_deg", "cars": "yaw_deg"}
-AXES: Mapping[str, Axis] = {
+AXES: Mapping[str, Axis] = {  # by name of the option
     axis.name: axis
     for axis in (
         Axis("yaw", "camera yaw", "view", {**_YAW, "cars": "azimuth_deg"}, 1, ("camera_y_rad",)),
@@ -97,7 +95,6 @@ AXES: Mapping[str, Axis] = {
         ),
     )
 }  # fmt: skip
-"""By name of the option."""
 
 
 def chosen_axes(names: Sequence[str], kind: str | None = None) -> tuple[Axis, ...]:
@@ -116,21 +113,14 @@ def checked_levels(levels: Sequence[float], axes: Sequence[Axis]) -> tuple[float
     if len(result) < 2 or any(b <= a for a, b in pairwise(result)):
         raise ValueError(f"angles must be two or more that grow, such as 0,30,60; got {words}")
     if result[0] < 0 or result[-1] > most:
-        raise ValueError(
-            f"angles must lie within 0..{most:g} degrees for {', '.join(axis.name for axis in axes)}, "
-            f"got {words}"
-        )
+        asked = ", ".join(axis.name for axis in axes)
+        raise ValueError(f"angles must lie within 0..{most:g} degrees for {asked}, got {words}")
     return result
 
 
-def either_side(level: float) -> tuple[float, ...]:
-    """The angle to the one side and to the other; 0 once."""
-    return (0.0,) if level == 0 else (-level, level)
-
-
 def all_angles(axes: Sequence[Axis], levels: Sequence[float]) -> list[tuple[Axis, float]]:
-    """Every axis at every level to either side, in the order of a trial's images."""
-    return [(axis, angle) for axis in axes for level in levels for angle in either_side(level)]
+    """Every axis at every level to either side, 0 once, in the order of a trial's images."""
+    return [(axis, angle) for axis in axes for level in levels for angle in sorted({level, -level})]
 
 
 @dataclass(frozen=True)
@@ -166,10 +156,10 @@ class Trial:
         for curve in self.curves:
             sizes = [len(rows) for rows in curve.points]
             if len(curve.learn) < 5 or 0 in sizes:
-                raise ValueError(
-                    f"{curve.title}: {len(curve.learn)} rows to learn from and {', '.join(map(str, sizes))} "
-                    "to be tested on: five and one are the least; give more images"
+                have = (
+                    f"{len(curve.learn)} rows to learn from and {', '.join(map(str, sizes))} to be tested on"
                 )
+                raise ValueError(f"{curve.title}: {have}: five and one are the least; give more images")
             both = np.intersect1d(self.unit[curve.learn], self.unit[np.concatenate(curve.points)])
             if len(both):
                 raise ValueError(f"{curve.title}: {len(both)} units would be both learned from and tested")
@@ -195,9 +185,9 @@ def stacked_trial(
 
     Rows without a label are neither learned from nor tested.
     """
-    test = np.arange(n_learn, len(task))
-    shown = np.concatenate((np.arange(len(task)), np.tile(test, len(all_angles(axes, levels)))))
-    sides = [len(test) * len(either_side(level)) for _ in axes for level in levels]
+    test, asked = np.arange(n_learn, len(task)), all_angles(axes, levels)
+    shown = np.concatenate((np.arange(len(task)), np.tile(test, len(asked))))
+    sides = [len(test) * len({level, -level}) for _ in axes for level in levels]
     parts = np.split(np.arange(len(shown)), np.cumsum([n_learn, len(test), *sides])[:-1])
     known = task.known[shown]
     learn, ordinary, *tested = (rows[known[rows]] for rows in parts)
@@ -226,10 +216,9 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if self.people < 2 or self.learned < 1 or self.tested < 1:
-            raise ValueError(
-                f"generated images need two people or more, each with an image to learn from and one to "
-                f"test; got {self.people} people, {self.learned} and {self.tested} images"
-            )
+            need = "two people or more, each with an image to learn from and one to test"
+            got = f"{self.people} people, {self.learned} and {self.tested} images"
+            raise ValueError(f"generated images need {need}; got {got}")
 
     def generate(
         self, part: str, count: int | None = None, axis: Axis | None = None, angle: float = 0.0
@@ -263,17 +252,15 @@ def generated_trial(recipe: Recipe, axes: Sequence[Axis], levels: tuple[float, .
     }  # fmt: skip
 
     def make() -> dict[str, np.ndarray]:
-        images, result, asked = [], {}, all_angles(axes, levels)
-        for part in ("learned", "tested"):
-            made = recipe.generate(part)
-            images.append(made.images)
-            result[part] = {"identity": made.identity, **made.labels}[recipe.label]
-            result[f"who_{part}"] = made.identity
+        made = {part: recipe.generate(part) for part in ("learned", "tested")}
+        values = {part: {"identity": one.identity, **one.labels}[recipe.label] for part, one in made.items()}
+        people = {f"who_{part}": one.identity for part, one in made.items()}
+        images, asked = [one.images for one in made.values()], all_angles(axes, levels)
         total, progress = sum(map(len, images)) + len(asked) * len(images[1]), how.stage("generating")
         for axis, angle in asked:
             images.append(recipe.generate("tested", axis=axis, angle=angle).images)
             progress(sum(map(len, images)), total)
-        return {"images": np.concatenate(images), **result}
+        return {"images": np.concatenate(images), **values, **people}
 
     result = how.memory.recall("generated", inputs, make)
     n_learn, values = len(result["learned"]), np.concatenate((result["learned"], result["tested"]))
@@ -283,10 +270,8 @@ def generated_trial(recipe: Recipe, axes: Sequence[Axis], levels: tuple[float, .
         names, counts = np.unique(values[:n_learn].astype(str), return_counts=True)
         values = np.where(np.isin(values.astype(str), names[counts > 1]), values.astype(str), "")
     if len(set(values[:n_learn]) - {""}) < 2:
-        raise ValueError(
-            f"fewer than two values of {recipe.label!r} have two images to learn from: make more people, "
-            "or more images of each"
-        )
+        what = f"fewer than two values of {recipe.label!r} have two images to learn from"
+        raise ValueError(f"{what}: make more people, or more images of each")
     unit = np.arange(len(values))
     if recipe.label != "identity":
         people = np.concatenate((result["who_learned"], result["who_tested"]))
@@ -371,8 +356,6 @@ def _curve(axis: Axis, angle: np.ndarray, unit: np.ndarray, task: Task, portions
     tested = tuple(rows(part) for part in (ordinary, *(part for part in far if len(part))))
     levels = tuple(float(angle[part].mean()) if len(part) else float("nan") for part in tested)
     if len(levels) < 2 or not all(b - a > 1e-6 for a, b in pairwise(levels)):
-        raise ValueError(
-            f"the true {axis.title} cannot be cut into {portions} portions of growing angle: the images "
-            "are too few, or all at one angle"
-        )
+        what = f"the true {axis.title} cannot be cut into {portions} portions of growing angle"
+        raise ValueError(f"{what}: the images are too few, or all at one angle")
     return Curve(axis.name, f"true {axis.title}", learn, levels, (tested[0], *tested))
