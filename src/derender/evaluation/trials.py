@@ -80,21 +80,16 @@ class Axis:
 
 
 _PITCH, _YAW = {"faces": "pitch_deg", "cars": "pitch_deg"}, {"faces": "yaw_deg", "cars": "yaw_deg"}
+_HEIGHT, _DIRECTION = ("light_pitch_rad",), ("light_yaw_rad", "light_pitch_rad")
 AXES: Mapping[str, Axis] = {  # by name of the option
     axis.name: axis
     for axis in (
         Axis("yaw", "camera yaw", "view", {**_YAW, "cars": "azimuth_deg"}, 1, ("camera_y_rad",)),
         Axis("pitch", "camera pitch", "view", {"faces": "pitch_deg"}, 0, ("camera_x_rad",), most_deg=60.0),
-        Axis(
-            "light", "light from the side", "light", _YAW, 3, ("light_yaw_rad", "light_pitch_rad"),
-            cleared=2, held="pitch_deg",
-        ),
-        Axis(
-            "light-pitch", "light from above and below", "light", _PITCH, 2, ("light_pitch_rad",),
-            cleared=3, held="yaw_deg",
-        ),
+        Axis("light", "light from the side", "light", _YAW, 3, _DIRECTION, 2, "pitch_deg"),
+        Axis("light-pitch", "light from above and below", "light", _PITCH, 2, _HEIGHT, 3, "yaw_deg"),
     )
-}  # fmt: skip
+}
 
 
 def chosen_axes(names: Sequence[str], kind: str | None = None) -> tuple[Axis, ...]:
@@ -156,9 +151,8 @@ class Trial:
         for curve in self.curves:
             sizes = [len(rows) for rows in curve.points]
             if len(curve.learn) < 5 or 0 in sizes:
-                have = (
-                    f"{len(curve.learn)} rows to learn from and {', '.join(map(str, sizes))} to be tested on"
-                )
+                tested = ", ".join(map(str, sizes))
+                have = f"{len(curve.learn)} rows to learn from and {tested} to be tested on"
                 raise ValueError(f"{curve.title}: {have}: five and one are the least; give more images")
             both = np.intersect1d(self.unit[curve.learn], self.unit[np.concatenate(curve.points)])
             if len(both):
@@ -171,17 +165,10 @@ class Trial:
         return ImageSet(self.images, files, source=self.how)
 
 
-def stacked_trial(
-    images: np.ndarray,
-    task: Task,
-    unit: np.ndarray,
-    n_learn: int,
-    axes: Sequence[Axis],
-    levels: tuple[float, ...],
-    how: str,
-    n_dropped: int,
-) -> Trial:
-    """A trial of ``n_learn`` training images, T test images, and these at ``all_angles``, in this order.
+def stacked(
+    task: Task, unit: np.ndarray, n_learn: int, axes: Sequence[Axis], levels: tuple[float, ...]
+) -> tuple[Task, np.ndarray, tuple[Curve, ...]]:
+    """For a trial of ``n_learn`` training images, T test images, and these at ``all_angles``, in this order.
 
     Rows without a label are neither learned from nor tested.
     """
@@ -195,7 +182,7 @@ def stacked_trial(
         Curve(axis.name, axis.title, learn, levels, (ordinary, *tested[at : at + len(levels)]))
         for axis, at in zip(axes, range(0, len(tested), len(levels)), strict=True)
     )
-    return Trial(images, task.select(shown), unit[shown].astype(np.int64), curves, how, n_dropped)
+    return task.select(shown), unit[shown].astype(np.int64), curves
 
 
 @dataclass(frozen=True)
@@ -278,7 +265,7 @@ def generated_trial(recipe: Recipe, axes: Sequence[Axis], levels: tuple[float, .
         unit = np.unique(people, return_inverse=True)[1]
     source, task = f"{recipe.label} of generated {recipe.kind}", task_of({recipe.label: values})
     dropped = int((~task.known).sum())
-    return stacked_trial(result["images"], task, unit, n_learn, axes, levels, source, dropped)
+    return Trial(result["images"], *stacked(task, unit, n_learn, axes, levels), source, dropped)
 
 
 def rendered_trial(
@@ -324,7 +311,8 @@ def rendered_trial(
         group = np.unique(groups.astype(str), return_inverse=True)[1]
         number = np.where(missing(groups), len(groups) + number, group)
     source, dropped = f"images of {pictures.layout} re-rendered", int((~task.known).sum())
-    return stacked_trial(images, task.select(rows), number[rows], len(learn), axes, levels, source, dropped)
+    parts = stacked(task.select(rows), number[rows], len(learn), axes, levels)
+    return Trial(images, *parts, source, dropped)
 
 
 def true_angle_trial(pictures: ImageSet, task: Task, axes: Sequence[Axis], *, portions: int = 3) -> Trial:
