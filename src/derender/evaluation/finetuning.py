@@ -23,11 +23,8 @@ from torch import Generator, Tensor, nn
 
 from derender.baselines.supervised import drawn_labelled
 from derender.data import ImageSet, Split, split_indices
-from derender.evaluation.bootstrap import RESAMPLES, ScoredRow, numbers_of, with_verdicts
-from derender.evaluation.feature_rows import control_rows, embedded_table
-from derender.evaluation.linear_probes import head_loss, probabilities
-from derender.evaluation.linear_probing import LINEAR_COLUMNS, compare_linear
-from derender.evaluation.linear_task import Rows, Task, task_of
+from derender.evaluation import bootstrap, feature_rows, linear_probes, linear_task
+from derender.evaluation.linear_probing import BOTH, LINEAR_COLUMNS, compare_linear
 from derender.evaluation.memory import Memory
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Scores, scored_table, verdict
@@ -45,7 +42,6 @@ from derender.training.task import Losses, PhaseProgress, Precision, StepLosses,
 from derender.training.watch import FiniteWatch
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
-BOTH = ("accuracy", "balanced_accuracy")
 RENDERING_TERMS = (
     *("photometric", "photometric_flip", "perceptual", "perceptual_flip", "smoothness", "curvature"),
     *NOT_RECONSTRUCTION,
@@ -86,7 +82,7 @@ class FinetunedModel(nn.Module):
 
     def predict(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs"]:
         """Probabilities for images in 0..1: of each label, or of every class."""
-        return probabilities(self.head(self.model.encode(images)), self.head.kind)
+        return linear_probes.probabilities(self.head(self.model.encode(images)), self.head.kind)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write a folder that `derender.load` takes, the head beside the model; complete or not at all."""
@@ -124,7 +120,7 @@ class JointLabels:
     """The labels of all images, and (N, A) those that training may see. The latter are -1 for training images
     beyond those labelled and for all tested ones. ``split`` is the run's own; its test part is never seen."""
 
-    asked: Task
+    asked: linear_task.Task
     visible: np.ndarray
     split: Split
 
@@ -139,17 +135,15 @@ def target_of(images: ImageSet, config: FinetuneConfig) -> JointLabels:
     if not target.labels:
         raise ValueError(f"name a label to learn; the images have {', '.join(images.labels) or 'no labels'}")
     names = ", ".join(target.labels)
-    asked = task_of({name: images.label(name) for name in target.labels})
+    asked = linear_task.task_of({name: images.label(name) for name in target.labels})
     split = split_indices(images.files, config.split, seed=config.seed)
     labelled = split.train[asked.known[split.train]]
     if target.labelled is not None:
         labelled = drawn_labelled(labelled, target.labelled, config.seed, names)
     known = asked.targets[labelled]
     if not ((known == 1).any(axis=0) & (known == 0).any(axis=0)).any():
-        raise ValueError(
-            f"the {len(labelled)} labelled images to learn from have one class of {names} only: use more of "
-            "them, or another seed"
-        )
+        what = f"the {len(labelled)} labelled images to learn from have one class of {names} only"
+        raise ValueError(f"{what}: use more of them, or another seed")
     visible = np.full_like(asked.targets, -1)
     for rows in (labelled, split.validation):
         visible[rows] = asked.targets[rows]
@@ -174,10 +168,8 @@ class FinetuneTask(TrainingTask):
         if config.target.rendering_weight > 0:
             require_perceptual(config.objective)
         if self.start is not None and self.start.settings != config.model:
-            raise ValueError(
-                "the networks of a pre-trained model are given: leave out settings of model.network and "
-                "model.ranges"
-            )
+            fix = "leave out settings of model.network and model.ranges"
+            raise ValueError(f"the networks of a pre-trained model are given: {fix}")
         model = copy.deepcopy(self.start) or Derenderer.seeded(config.model, config.seed)
         chosen(factors, {factor.name: factor for factor in model.factors})
         with torch.random.fork_rng(devices=[]):
@@ -214,7 +206,7 @@ class FinetuneTask(TrainingTask):
             weight = target.rendering_weight
             terms = {name: value if name == "l1" else weight * value for name, value in result.terms.items()}
             labels = known[rows.to(known.device, non_blocking=True)]
-            loss = target.weight * head_loss(head(codes)[None], labels[None], head.kind)[0]
+            loss = target.weight * linear_probes.head_loss(head(codes)[None], labels[None], head.kind)[0]
             terms["target"] = loss.detach()
             return replace(result, total=weight * result.total + loss, terms=terms)
 
@@ -232,7 +224,7 @@ def score_finetuned(
     task: FinetuneTask,
     *,
     began: str = "fresh weights",
-    resample_count: int = RESAMPLES,
+    resample_count: int = bootstrap.RESAMPLES,
     memory: Memory | None = None,
     progress: Progress | None = None,
 ) -> Scores:
@@ -249,10 +241,8 @@ def score_finetuned(
     test = target.split.test[target.asked.known[target.split.test]]
     train = target.split.train[(target.visible[target.split.train] >= 0).any(axis=1)]
     if len(test) < 2:
-        raise ValueError(
-            f"the test part has {len(test)} images with a label, two are needed to score: "
-            "bring more images, or set a larger test share in split="
-        )
+        fix = "bring more images, or set a larger test share in split="
+        raise ValueError(f"the test part has {len(test)} images with a label, two are needed to score: {fix}")
 
     def answered() -> np.ndarray:
         parts = map_batches(tuned.predict, tuned, task.images[test], batch_size=256)
@@ -266,32 +256,32 @@ def score_finetuned(
     shown, fitted = (ImageSet(task.images[some], tuple(map(str, some.tolist()))) for some in parts)
     factors, device = task.config.target.factors, tuned.device.type
     options = Options(factors=factors, untrained_seeds=1, seed=seed, device=device, cache=kept)
-    runs = {"frozen": [embedded_table(start, shown, options).concatenate(factors)]}
-    runs |= {row.name: row.arrays() for row in control_rows(shown, start.settings, options, fit_on=fitted)}
+    runs = {"frozen": [feature_rows.embedded_table(start, shown, options).concatenate(factors)]}
+    controls = feature_rows.control_rows(shown, start.settings, options, fit_on=fitted)
+    runs |= {row.name: row.arrays() for row in controls}
     asked = target.asked.select(learned_and_tested)
-    rows = Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
+    rows = linear_task.Rows(np.arange(count, len(asked)), {count: np.arange(count)[None]})
     same = {"task": asked, "rows": rows, "seeds": (seed,), "resample_count": resample_count, "memory": kept}
     compared = partial(compare_linear, **same)
     tuned_answers = {"fine-tuned": {count: answers[None]}}
     logistic, joint = compared(runs, heads=("logistic",), finetuned=tuned_answers, progress=progress).parts
     (paper,) = compared({"frozen": runs["frozen"]}, heads=("linear",)).parts
-    (ours, majority), (frozen, *controls, _) = joint.rows, logistic.rows
-    beside = {"frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
-    beside |= {f"{row.name}, logistic": row for row in controls} | {"majority": majority}
-    others = [ScoredRow(name, True, 1, row.scores) for name, row in beside.items()]
-    scored = (ScoredRow("fine-tuned", False, 1, ours.scores), *others)
-    judged = with_verdicts(scored)
+    (ours, majority), (frozen, *likewise, _) = joint.rows, logistic.rows
+    beside = {"fine-tuned": ours, "frozen, logistic": frozen, "frozen, paper's head": paper.rows[0]}
+    beside |= {f"{row.name}, logistic": row for row in likewise} | {"majority": majority}
+    scored = tuple(bootstrap.ScoredRow(name, row is not ours, 1, row.scores) for name, row in beside.items())
+    judged = bootstrap.with_verdicts(scored)
     notes = [verdict(judged[0], score, LINEAR_COLUMNS[score]) for score in BOTH]
     unlabelled, names = int((~target.asked.known).sum()), asked.names
     task_name = f"{len(names)} classes" if asked.kind == "classes" else f"mean of {len(names)} yes/no labels"
-    caption = (
-        f"{task_name}: {count:,} labelled images learned, {len(test):,} held out; frozen features of {began}"
-    )
+    split = f"{count:,} labelled images learned, {len(test):,} held out"
+    caption = f"{task_name}: {split}; frozen features of {began}"
     if unlabelled:
         caption += f"; {unlabelled:,} images without label never asked"
     table = scored_table(caption, "trained on labels", scored, LINEAR_COLUMNS, intervals=BOTH, deviations=())
+    versus = {score: asdict(judged[0].versus[score]) for score in BOTH}
     values = {
-        "rows": numbers_of(scored), "versus": {score: asdict(judged[0].versus[score]) for score in BOTH},
+        "rows": bootstrap.numbers_of(scored), "versus": versus,
         "kind": asked.kind, "names": names, "n_train": count, "n_test": len(test), "n_unlabelled": unlabelled,
     }  # fmt: skip
     return Scores([table], values, notes, result=scored)

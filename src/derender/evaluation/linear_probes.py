@@ -31,19 +31,15 @@ from derender.evaluation.neighbours import finite_rows, unit_rows
 from derender.features import named
 from derender.settings import Settings
 
-PROBES = {
+PROBES = {  # all there are, and how tables call them
     "linear": "the paper's head, frozen features",
     "centred": "the paper's head, frozen features, centred",
     "logistic": "penalised logistic regression",
     "k-NN": "10 nearest neighbours",
 }
-"""All there are, and how tables call them."""
-
-HEADS = ("linear", "logistic", "k-NN")
-"""Asked where none are named."""
-
+HEADS = ("linear", "logistic", "k-NN")  # asked where none are named
+# C for rows whose mean squared length is 1: standardised features divided by the root of their number
 PENALTIES = (1e-2, 1e-1, 1.0, 1e1, 1e2, 1e3)
-"""C for rows whose mean squared length is 1: standardised features divided by the root of their number."""
 FOLDS = 5
 BLOCK_ROWS, MOST_STEPS = 1_024, 2_000
 
@@ -95,9 +91,8 @@ def probe(
     def make() -> np.ndarray:
         if not papers:
             return np.stack(list(map(learned, rows, seeds))).astype(np.float32)
-        how: dict[str, Any] = {"seeds": seeds, "settings": settings, "centred": head == "centred"}
         asked = torch.from_numpy(np.ascontiguousarray(features[tested]))
-        heads = zip(*fitted_heads(features, targets, rows, kind=kind, **how), strict=True)
+        heads = zip(*fitted_heads(features, task, rows, seeds, settings, head == "centred"), strict=True)
         return np.stack([probabilities(torch.addmm(b, asked - m, w), kind).numpy() for m, w, b in heads])
 
     return (memory or Memory()).recall_one(f"probe-{head}", inputs, make)
@@ -140,38 +135,33 @@ def _shares(targets: np.ndarray) -> np.ndarray:
 
 def fitted_heads(
     features: np.ndarray,
-    targets: np.ndarray,
+    task: Task,
     rows: np.ndarray,
-    *,
-    kind: str,
     seeds: Sequence[int],
-    settings: HeadSettings = PAPER_HEAD,
-    centred: bool = False,
+    settings: HeadSettings,
+    centred: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Train one head for each seed at once: (S, 1, D) means, (S, D, A) weights, (S, 1, A) biases.
 
     Args:
-        features, targets: (N, D); (N, A) in -1 (unknown, no part in the loss), 0, 1.
+        features, task: (N, D); (N, A) targets in -1 (unknown, no part in the loss), 0, 1, and their kind.
         rows: (S, n) training rows of each seed.
-        kind, settings: "labels" or "classes"; of the training.
-        seeds: (S,) for the start and the order of rows.
+        seeds, settings: (S,) for the start and the order of rows; of the training.
         centred: take the mean of each seed's training rows from all features first; else the means are 0.
     """
     x = torch.from_numpy(np.ascontiguousarray(features, np.float32))
-    y = torch.from_numpy(np.asarray(targets, np.float32))
+    y = torch.from_numpy(np.asarray(task.targets, np.float32))
     streams, chosen = [torch.Generator().manual_seed(seed) for seed in seeds], torch.from_numpy(rows)
     shapes = (x.shape[1], y.shape[1]), (1, y.shape[1])
     starts = (torch.stack([torch.rand(shape, generator=one) for one in streams]) for shape in shapes)
     # uniform in +-1/sqrt(inputs), as torch's linear layer starts
     weight, bias = (((start * 2 - 1) / x.shape[1] ** 0.5).requires_grad_() for start in starts)
     optimiser = torch.optim.Adam([weight, bias], lr=settings.learning_rate)
-    means = x.new_zeros(len(rows), 1, x.shape[1])
-    if centred:
-        means = torch.stack([x[own].mean(dim=0, keepdim=True) for own in chosen])
+    means = torch.stack([x[own].mean(dim=0, keepdim=True) for own in chosen]) * centred
     for _ in range(settings.epochs):
         orders = [own[torch.randperm(len(own), generator=g)] for own, g in zip(chosen, streams, strict=True)]
         for batch in torch.stack(orders).split(settings.batch_size, dim=1):
-            loss = head_loss(torch.baddbmm(bias, x[batch] - means, weight), y[batch], kind).sum()
+            loss = head_loss(torch.baddbmm(bias, x[batch] - means, weight), y[batch], task.kind).sum()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
@@ -226,10 +216,9 @@ def logistic_weights(
     each label has its C, (A,), of "classes" all have one, (1,).
     """
     if len(features) < folds or folds < 2:
-        raise ValueError(
-            f"{len(features)} rows cannot be cut into {folds} folds: a penalty is chosen on {max(folds, 2)} "
-            "labelled rows or more; give more, or choose the linear or the k-NN head"
-        )
+        need = f"a penalty is chosen on {max(folds, 2)} labelled rows or more"
+        fix = "give more, or choose the linear or the k-NN head"
+        raise ValueError(f"{len(features)} rows cannot be cut into {folds} folds: {need}; {fix}")
     (rows, mean, back), labels = rotated(features), np.asarray(targets, np.float64)
     fold = np.random.default_rng(seed).permutation(len(rows)) % folds
     learned, single, losses = fold[:, None] != np.arange(folds), rows.astype(np.float32), []

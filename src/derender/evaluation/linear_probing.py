@@ -42,6 +42,7 @@ LINEAR_COLUMNS = {
     "balanced_accuracy": Column("balanced", "high", note="mean recall over values or classes, 0 to 1"),
     "average_precision": Column("AP", "high", note="average precision, 0 to 1"),
 }
+BOTH = ("accuracy", "balanced_accuracy")  # those that have an interval
 FINETUNED, SUPERVISED = "fine-tuned", "ResNet-18, supervised"
 PROBE_NAMES = {**probes.PROBES, FINETUNED: "the paper's head, encoders trained too"}
 
@@ -169,9 +170,8 @@ def compare_prepared(
             "settings": settings.model_dump(),
         }  # fmt: skip
         progress = options.stage(f"fine-tuning {what}, {count:,} labels, seed {seeds[at]}", "epochs")
-        how: dict[str, Any] = {"seed": seeds[at], "settings": settings, "progress": progress}
-        learn = partial(finetune, model, images, task, training, split.test, factors=chosen, **how)
-        return options.memory.recall_one("finetuned", inputs, learn)
+        fit = partial(finetune, model, images, task, training, split.test, factors=chosen, settings=settings)
+        return options.memory.recall_one("finetuned", inputs, partial(fit, seed=seeds[at], progress=progress))
 
     opened = partial(feature_rows.opened, device=options.device)
     trained = {name: list(map(opened, runs)) for name, runs in (models or {}).items()}
@@ -223,9 +223,8 @@ def compare_linear(
 
     def scored(name: str, answers: np.ndarray) -> bootstrap.ScoredRow:
         """Scores of (S, T, A) answers; average precision has no interval."""
-        both = ("accuracy", "balanced_accuracy")
         counted = np.stack([count_scores(truth, answer, task.kind, weights) for answer in answers])
-        row = bootstrap.scored_row(name, name in {*controls, "majority"}, both, counted)
+        row = bootstrap.scored_row(name, name in {*controls, "majority"}, BOTH, counted)
         precision = bootstrap.constant([mean_precision(truth, answer) for answer in answers], resample_count)
         return replace(row, scores={**row.scores, "average_precision": precision})
 

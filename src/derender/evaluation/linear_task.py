@@ -161,19 +161,17 @@ def mean_precision(targets: np.ndarray, probabilities: np.ndarray) -> float:
     return float(np.mean(precisions)) if precisions else float("nan")
 
 
-def count_scores(
-    targets: np.ndarray, probabilities: np.ndarray, kind: str, weights: np.ndarray
-) -> np.ndarray:
+def count_scores(targets: np.ndarray, answers: np.ndarray, kind: str, weights: np.ndarray) -> np.ndarray:
     """Accuracy and balanced accuracy of ``linear_scores``, (B, 2), where (B, T) ``weights`` draw the rows."""
-    if targets.shape != probabilities.shape:
-        raise ValueError(f"targets {targets.shape} and probabilities {probabilities.shape} must be alike")
+    if targets.shape != answers.shape:
+        raise ValueError(f"targets {targets.shape} and probabilities {answers.shape} must be alike")
     positive, negative = (targets == 1).astype(np.float32), (targets == 0).astype(np.float32)
     if kind == "classes":
-        right = probabilities.argmax(axis=1) == targets.argmax(axis=1)
+        right = answers.argmax(axis=1) == targets.argmax(axis=1)
         hits, sizes = weights @ (positive * right[:, None]), weights @ positive
         balanced = np.nanmean(_share(hits, sizes), axis=1)
         return np.column_stack((hits.sum(axis=1) / sizes.sum(axis=1), balanced))
-    answered = probabilities > 0.5
+    answered = answers > 0.5
     yes, no = weights @ (positive * answered), weights @ (negative * ~answered)
     positives, negatives = weights @ positive, weights @ negative
     recalls = np.stack((_share(yes, positives), _share(no, negatives)))

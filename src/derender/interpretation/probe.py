@@ -212,8 +212,8 @@ def fit_probe(
         how = {"kind": task.kind, "penalties": PENALTIES, "folds": min(FOLDS, len(x)), "seed": seed}
         weight, bias, _ = logistic_weights(x, y, **how)
     else:
-        how = {"kind": task.kind, "seeds": [seed], "settings": settings}
-        _, result, start = fitted_heads(x, y, np.arange(len(x))[None], **how)
+        every = np.arange(len(x))[None]
+        _, result, start = fitted_heads(x, task.select(rows), every, [seed], settings, centred=False)
         weight, bias = result[0].double().numpy(), start[0, 0].double().numpy()
     if task.kind == "classes":
         weight, bias = weight - weight.mean(axis=1, keepdims=True), bias - bias.mean()
