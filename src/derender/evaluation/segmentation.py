@@ -18,8 +18,7 @@ import numpy as np
 
 from derender.data import read_masks
 from derender.data.source import evenly_spaced
-from derender.evaluation import segmenters
-from derender.evaluation.bootstrap import ScoredRow, numbers_of, scored_row, with_verdicts
+from derender.evaluation import bootstrap, segmenters
 from derender.evaluation.memory import Memory, content_hash
 from derender.evaluation.options import Options
 from derender.evaluation.paper_tables import SEGMENTATION, beside_the_paper
@@ -32,13 +31,11 @@ from derender.storage.places import counted
 
 SHOWN = 8
 TOP = 10
-COLUMNS = {
+COLUMNS = {  # all best at 1; top10_iou is higher by selection alone, background, skin and hair decide pixels
     "mean_iou": Column("mIoU", "high", note="intersection over union, mean over classes, 0 to 1"),
     "top10_iou": Column("top 10", "high", note="the same over the row's own ten best classes, 0 to 1"),
     "pixel_accuracy": Column("pixels", "high", note="share of right pixels, 0 to 1"),
 }
-"""By score, all best at 1. ``top10_iou`` is higher by selection alone; background, skin and hair decide
-``pixel_accuracy``."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class SegmentationRow:
     weights; ``losses`` are (R, epochs). ``shown`` are the first run's answers for the comparison's images.
     """
 
-    scored: ScoredRow
+    scored: bootstrap.ScoredRow
     class_iou: np.ndarray
     trainable: int
     losses: np.ndarray
@@ -80,7 +77,7 @@ class SegmentationComparison:
         def by_class(values: np.ndarray) -> dict[str, float]:
             return dict(zip(data.classes, values.tolist(), strict=True))
 
-        rows = numbers_of(row.scored for row in self.rows)
+        rows = bootstrap.numbers_of(row.scored for row in self.rows)
         for row in self.rows:
             more = {"trainable": row.trainable, "class_iou": by_class(row.class_iou)}
             rows[row.scored.name] |= {**more, "losses": row.losses.tolist()}
@@ -184,7 +181,7 @@ def segment(
         result = np.stack([resampled_scores(run["counts"], weights) for run in runs])
         iou = np.mean([class_iou(run["counts"]) for run in runs], axis=0)
         losses = np.array([run["losses"] for run in runs if trainable])
-        scored = scored_row(title, control, COLUMNS, result)
+        scored = bootstrap.scored_row(title, control, COLUMNS, result)
         return SegmentationRow(scored, iou, trainable, losses, runs[0]["shown"])
 
     rows = []
@@ -206,7 +203,7 @@ def segment(
     for title, control in segmenters.CONTROLS.items():
         made = partial(lambda control: counted(control(data)), control)
         rows.append(row(title, True, [apart.recall("segment-control", {**same, "control": title}, made)], 0))
-    judged = zip(rows, with_verdicts([row.scored for row in rows]), strict=True)
+    judged = zip(rows, bootstrap.with_verdicts([row.scored for row in rows]), strict=True)
     compared = tuple(replace(row, scored=scored) for row, scored in judged)
     result = SegmentationComparison(compared, data, tuple(seeds), settings, shown)
     values = {"data": data.source, **result.numbers()}
