@@ -17,28 +17,30 @@ from derender.evaluation import bootstrap
 from derender.evaluation.score_table import Column, ScoreTable, scored_table
 from derender.storage.places import counted
 
-LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)
-"""Edges of Extended Yale B's subsets: the angle between light and view."""
+LIGHT_BINS_DEG = (12.0, 25.0, 50.0, 77.0)  # edges of Yale B's subsets: the angle between light and view
+TITLES = {  # of rows, by field of a result
+    "model": "model", "average_depth": "average depth", "plane": "plane", "constant": "constant answer",
+    "mean_picture": "mean image", "components": "PCA ({0.n_components})", "untrained": "untrained model",
+}  # fmt: skip
 
 
 class ImageResult:
     """A model's scores beside its controls, all on the same images.
 
     ``columns`` are of the scores, ``caption`` has a place for the number of images. ``coverage`` is the
-    column of ``coverage`` where rows have that. ``titles`` name the rows by field, the model first, with a
+    column of ``coverage`` where rows have that. ``TITLES`` name the rows by field, the model first, with a
     place for the result's numbers. ``notes`` are on rows, by their name.
     """
 
     columns: ClassVar[Mapping[str, Column]]
     caption: ClassVar[str]
     coverage: ClassVar[Column | None] = None
-    titles: ClassVar[Mapping[str, str]] = {}
     notes: ClassVar[Mapping[str, str]] = {}
 
     def named(self) -> dict[str, Any]:
         """By row those that were scored: objects with (N,) of each score as ``SCORE_each``."""
-        scored = {title.format(self): getattr(self, field) for field, title in self.titles.items()}
-        return {title: scores for title, scores in scored.items() if scores is not None}
+        scored = {field: getattr(self, field, None) for field in TITLES}
+        return {TITLES[field].format(self): scores for field, scores in scored.items() if scores is not None}
 
     def each(self) -> dict[str, dict[str, np.ndarray]]:
         """Every score of every image, (N,), by row."""

@@ -9,7 +9,6 @@ SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of
 several scales and learned similarities.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -53,18 +52,14 @@ class ReconstructionResult(ImageResult):
     own.
     """
 
-    columns: ClassVar[Mapping[str, Column]] = {
+    columns: ClassVar = {
         "l1": Column("L1", "low", 4, "mean absolute difference inside the mask, 0 to 1, best 0"),
         "psnr_db": Column("PSNR", "high", 2, "peak signal-to-noise ratio in decibels"),
         "ssim": Column("SSIM", "high", note="structural similarity inside the mask, at most 1"),
     }
     caption = "Reconstruction of {}"
     coverage = Column("coverage", None, note="share of all pixels inside the mask")
-    titles: ClassVar[Mapping[str, str]] = {
-        "model": "model", "mean_picture": "mean image", "components": "PCA ({0.n_components})",
-        "untrained": "untrained model",
-    }  # fmt: skip
-    notes: ClassVar[Mapping[str, str]] = {"untrained model": "same networks, fresh weights, in its own mask"}
+    notes: ClassVar = {"untrained model": "same networks, fresh weights, in its own mask"}
 
     model: ReconstructionScores
     mean_picture: ReconstructionScores

@@ -12,7 +12,6 @@ rotation is compared after the best one. Leaves out translations: at 10 degrees 
 against depth.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -58,7 +57,7 @@ class GeometryResult(ImageResult):
     """Errors of the predicted depth beside those of controls, all on the same images. Controls are the mean
     true depth map, constant depth, and fresh weights (None without an architecture)."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
+    columns: ClassVar = {
         "side": Column("SIDE x 100", "low", note="scale-invariant depth error times 100, best 0", scale=100),
         "mad_deg": Column("MAD", "low", 1, "mean angle between normals in degrees, best 0"),
     }
@@ -66,10 +65,7 @@ class GeometryResult(ImageResult):
     coverage = Column(
         "coverage", None, note="share of the true object that the prediction covers; errors count only there"
     )
-    titles: ClassVar[Mapping[str, str]] = {
-        "model": "model", "average_depth": "average depth", "plane": "plane", "untrained": "untrained model",
-    }  # fmt: skip
-    notes: ClassVar[Mapping[str, str]] = {
+    notes: ClassVar = {
         "average depth": "the mean true depth map, the same for every image",
         "untrained model": "same networks, fresh weights",
     }
@@ -206,7 +202,7 @@ class FactorScores:
 class FactorResult(ImageResult):
     """Errors in albedo, light and camera beside the best constant answer, and fresh weights if requested."""
 
-    columns: ClassVar[Mapping[str, Column]] = {
+    columns: ClassVar = {
         "albedo": Column("albedo", "low", 4, "root mean square error after each image's best scale, best 0"),
         "albedo_global": Column("one scale", "low", 4, "the same after one scale for all images"),
         "light": Column("light", "low", 1, "mean degrees between true and predicted direction, best 0"),
@@ -214,12 +210,7 @@ class FactorResult(ImageResult):
         "camera": Column("camera", "low", 1, "mean angle in degrees of the remaining rotation, best 0"),
     }
     caption = "Albedo, light and camera on {}"
-    titles: ClassVar[Mapping[str, str]] = {
-        "model": "model", "constant": "constant answer", "untrained": "untrained model"
-    }  # fmt: skip
-    notes: ClassVar[Mapping[str, str]] = {
-        "constant answer": "mean albedo, mean light, a camera that never turns"
-    }
+    notes: ClassVar = {"constant answer": "mean albedo, mean light, a camera that never turns"}
 
     model: FactorScores
     constant: FactorScores
