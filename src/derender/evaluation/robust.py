@@ -7,7 +7,6 @@ features, angles and scores, so that differences are paired.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,7 @@ from derender.features import FeatureTable, named, table_labels
 from derender.inputs import Progress, as_model
 
 WAYS = (*trials.LABELS, "render", "truth")
-SCORES = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}
-"""By score, its name in tables and charts."""
+SCORES = {"accuracy": "accuracy", "balanced_accuracy": "balanced accuracy"}  # names in tables and charts
 LEARNED_SHARE = 0.8
 ORDINARY, AREA = "ordinary", "area"
 _AREA = Column("area", "high", note="mean height of the curve over the angles, 0 to 1, best 1")
@@ -118,12 +116,10 @@ def robustness(
     for name, net in nets.items():
         table = feature_rows.embedded_table(net, trial.pictures, how, f"embedding {name}")
         joined, prefix = " + ".join(how.chosen or table.factors), f"{name}: " if len(nets) > 1 else ""
-        rows.append(feature_rows.FeatureRow(f"{prefix}{joined}", (table,), how.chosen))
-        if len(rows) == 1:
-            single = [one for one in table.factors if one != joined]
-            rows += [feature_rows.FeatureRow(f"{prefix}{one}", (table,), (one,)) for one in single]
-    learned_from = np.unique(np.concatenate([curve.learn for curve in trial.curves]))
-    fit_on = trial.pictures.select(learned_from)
+        single = {one: (one,) for one in table.factors if not rows and one != joined}
+        shown = {joined: how.chosen, **single}
+        rows += [feature_rows.FeatureRow(f"{prefix}{one}", (table,), own) for one, own in shown.items()]
+    fit_on = trial.pictures.select(np.unique(np.concatenate([curve.learn for curve in trial.curves])))
     rows += feature_rows.control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
     result = compare_robustness(
         {row.name: row.arrays() for row in rows}, trial, how.seeds(seeds),
@@ -247,17 +243,16 @@ def compare_robustness(
 
     def scored(curve: Curve, answers: Mapping[str, np.ndarray]) -> dict[str, tuple[bootstrap.ScoredRow, ...]]:
         """By score, a row for each of the (S, T, A) answers for the rows ``tested``."""
-        truths = [task.targets[rows] for rows in curve.points]
-        places = [np.searchsorted(tested, rows) for rows in curve.points]
-        units = [trial.unit[rows] for rows in curve.points]
-        draws: dict[bytes, int] = {}  # points of the same units share one, others never lack rows
-        starts = [seed + 1_000 * draws.setdefault(np.unique(own).tobytes(), len(draws)) for own in units]
-        weights = list(map(bootstrap.once_and_resampled, units, repeat(resample_count), starts))
+        asked, draws = [], {}  # points of the same units share a draw, others never lack rows
+        for rows in curve.points:
+            unit = trial.unit[rows]
+            start = seed + 1_000 * draws.setdefault(np.unique(unit).tobytes(), len(draws))
+            weights = bootstrap.once_and_resampled(unit, resample_count, start)
+            asked.append((task.targets[rows], np.searchsorted(tested, rows), weights))
         names = (ORDINARY, AREA, *map(level_name, curve.levels))
 
         def scores(run: np.ndarray) -> np.ndarray:
             """(1 + B, 1 + points, 2) both scores, the area second."""
-            asked = zip(truths, places, weights, strict=True)
             ordinary, *levels = (count_scores(truth, run[at], task.kind, own) for truth, at, own in asked)
             area = area_under(curve.levels, np.stack(levels, axis=-1))
             return np.stack((ordinary, area, *levels), axis=1)

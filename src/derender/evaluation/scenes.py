@@ -29,10 +29,8 @@ from derender.inputs import as_images, as_model
 from derender.model import Derenderer
 from derender.scene import Scene
 
-SCENES_KEPT = 512 * 1024**2
-"""Bytes of images whose optimised scenes are kept while a model is scored."""
-Protocols = dict[str, tuple[type[ImageResult], Callable[[], Any]]]
-"""By name the class of the result, and a call that makes it."""
+SCENES_KEPT = 512 * 1024**2  # bytes of images whose optimised scenes are kept while a model is scored
+Protocols = dict[str, tuple[type[ImageResult], Callable[[], Any]]]  # the result's class, a call that makes it
 
 
 def geometry(
@@ -58,19 +56,16 @@ def geometry(
     """
     how = Options.of(options)
     model = as_model(model, device=how.device)
-    exact = truth
-    if not isinstance(exact, GroundTruth):
-        exact = read_ground_truth(exact, limit=how.limit, image_size=model.image_size)
-    names = ("images", "depth", "mask", "normal", "albedo", "light", "camera")
-    known = {name: getattr(exact, name) for name in names if getattr(exact, name) is not None}
+    if not isinstance(truth, GroundTruth):
+        truth = read_ground_truth(truth, limit=how.limit, image_size=model.image_size)
+    known = {name: maps for name, maps in vars(truth).items() if isinstance(maps, np.ndarray)}
     scored = optimised(model, fit_steps)
     same: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, how.seed)}
-    again = partial(pixels.evaluate_reconstruction, scored, exact.images, components_of=exact.images, **same)
-    protocols: Protocols = {
-        "geometry": (GeometryResult, partial(evaluate_geometry, scored, exact, progress=how.progress, **same))
-    }
+    first = partial(evaluate_geometry, scored, truth, progress=how.progress, **same)
+    again = partial(pixels.evaluate_reconstruction, scored, truth.images, components_of=truth.images, **same)
+    protocols: Protocols = {"geometry": (GeometryResult, first)}
     if {"albedo", "light", "camera"} <= set(known):
-        protocols["factors"] = FactorResult, partial(evaluate_factors, scored, exact, **same)
+        protocols["factors"] = FactorResult, partial(evaluate_factors, scored, truth, **same)
     protocols["reconstruction"] = pixels.ReconstructionResult, again
     return _scored(model, protocols, {**known, "seed": how.seed, "steps": fit_steps or 0}, how)
 
@@ -116,8 +111,7 @@ def _scored(model: Derenderer, protocols: Protocols, inputs: Mapping[str, Any], 
     inputs = {"weights": model_fingerprint(model), "model": settings, **inputs}
     result = {name: how.memory.recall_value(name, inputs, *protocol) for name, protocol in protocols.items()}
     rows = {name: one.rows(how.resamples, how.seed) for name, one in result.items()}
-    asked = [(rows[name][0], one.columns) for name, one in result.items()]
-    notes = [verdict(row, *column) for row, columns in asked for column in columns.items()]
+    notes = [verdict(rows[name][0], *one) for name in rows for one in result[name].columns.items()]
     intervals = {name: numbers_of(scored) for name, scored in rows.items()}
     values = {"pictures": len(inputs["images"]), **result, "intervals": intervals}
     tables = [one.table(rows[name]) for name, one in result.items()]
