@@ -58,15 +58,12 @@ def compare(
     spec = named(TABLES, table, "table")
     how = Options.of(options, images=images, descriptors=table == "identity")
     given = {name: feature_rows.runs_of(runs) for name, runs in features.items()}
-    models = {name: list(filter(feature_rows.is_model, runs)) for name, runs in given.items()}
-    models = {name: runs for name, runs in models.items() if runs}
+    models = {name: own for name, runs in given.items() if (own := list(filter(feature_rows.is_model, runs)))}
     numbers = {"table": table, "number": spec.number}
     if spec.kind == "segment":
         if images is None or isinstance(images, ImageSet) or not models or len(models) < len(features):
-            raise ValueError(
-                f"table {table!r} trains nets from a model's encoders, and features do not do: give models "
-                "and the address of images that have masks"
-            )
+            what = f"table {table!r} trains nets from a model's encoders, and features do not do"
+            raise ValueError(f"{what}: give models and the address of images that have masks")
         tables, values = [], {}
         for name, (model, *others) in models.items():
             if others:
@@ -133,18 +130,14 @@ def compare(
             caption = f"{part.name}, {beside} ({METHODS[method]})"
             last = {"intervals": (), "deviations": (), "more": interval_cells("accuracy", shown["accuracy"])}
             ours = scored_table(caption, "features", scored, shown, **last)
-            tables += [
-                beside_the_paper(ours, (*shown, "interval"), part.paper, more["differs"]),
-                *clustering_tables(result, f"{part.name}: above the strongest control?"),
-            ]
+            tables.append(beside_the_paper(ours, (*shown, "interval"), part.paper, more["differs"]))
+            tables += clustering_tables(result, f"{part.name}: above the strongest control?")
             if ready.n_dropped:
                 beyond = "rows without a label or beyond its sizes left out"
                 notes.append(f"{part.name}: {ready.n_dropped:,} {beyond}")
         else:
-            result = compare_prepared(
-                ready, counts, how.seeds(seeds), how, models=models if finetune else None,
-                supervised=supervised,
-            )  # fmt: skip
+            also = {"models": models if finetune else None, "supervised": supervised}
+            result = compare_prepared(ready, counts, how.seeds(seeds), how, **also)
             more |= {"differs": part.differs(layout, len(ready.table))}
             caption = f"{part.name}: accuracy of the paper's head, {beside}"
             tables += [heads_table(caption, result, part.paper, more["differs"]), *linear_tables(result)]
@@ -167,7 +160,7 @@ def heads_table(
     lines: dict[str, dict[str, float]] = {}
     for line in paper:
         lines.setdefault(line.method, {}).update(line.scores)
-    asked = {method: scores for method, scores in lines.items() if set(scores) & set(columns)}
+    asked = {method: scores for method, scores in lines.items() if scores.keys() & columns.keys()}
     known = [PaperRow(method, paper[0].dataset, scores) for method, scores in asked.items()]
     rows = [Row(name, tuple(map(own.get, columns)), name in controls) for name, own in ours.items()]
     table = ScoreTable(caption, "features", tuple(columns.values()), rows)

@@ -33,13 +33,10 @@ class PaperRow:
 def _lines(part: str) -> tuple[PaperRow, ...]:
     """The paper's lines of a part, in its order."""
     text = (files("derender.evaluation") / "paper_tables.csv").read_text(encoding="utf-8")
-    results = []
-    for line in csv.DictReader(text.splitlines()):
-        if line.pop("part") == part:
-            method, dataset = line.pop("method"), line.pop("dataset")
-            scores = {name: float(value) for name, value in line.items() if value}
-            results.append(PaperRow(method, dataset, scores))
-    return tuple(results)
+    lines = [line for line in csv.DictReader(text.splitlines()) if line.pop("part") == part]
+    about = [(line.pop("method"), line.pop("dataset")) for line in lines]
+    scores = [{name: float(value) for name, value in line.items() if value} for line in lines]
+    return tuple(PaperRow(*names, own) for names, own in zip(about, scores, strict=True))
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ class TableSpec:
     parts: tuple[Part, ...]
 
 
-TABLES = {
+TABLES = {  # by name on the command line, in the order of the paper's: parts of one come after the whole
     "clustering": TableSpec(1, "cluster", (IDENTITY, EMOTION, FACE_ATTRIBUTES)),
     "identity": TableSpec(1, "cluster", (IDENTITY,)),
     "emotion": TableSpec(1, "cluster", (EMOTION,)),
@@ -121,7 +118,6 @@ TABLES = {
     "segmentation": TableSpec(3, "segment", (SEGMENTATION,)),
     "cars": TableSpec(4, "cluster", (CARS,)),
 }
-"""By name on the command line, in the order of the paper's tables: parts of one come after the whole."""
 
 
 def beside_the_paper(
