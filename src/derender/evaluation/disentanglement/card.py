@@ -35,8 +35,7 @@ from derender.storage.places import counted
 
 MODEL = "model"
 MIN_IMAGES = 20
-ENDS = ("ratio_95", "ratio_parameters_95")
-"""Intervals of the swap ratio, of features and of decoded parameters."""
+ENDS = ("ratio_95", "ratio_parameters_95")  # of the swap ratio, of features and of decoded parameters
 
 _SWAP = Column("swap", "high", 2, "move of the exchanged feature over the others'; chance 1")
 _DECODED = Column("decoded", "high", 2, "the same of decoded depth, albedo, light and camera")
@@ -168,9 +167,8 @@ class DisentanglementCard:
         rows = [Row(*row) for row in zip(self.features, cells.tolist(), strict=True)]
         loss = [*self.mean("swap.unexchanged").tolist(), None, None]
         rows.append(Row("nothing", loss, True, "from an image to its own rendering"))
-        caption = (
-            "Swap test, features: 1 is the distance of two images; best 1 for the one exchanged, 0 elsewhere"
-        )
+        best = "best 1 for the one exchanged, 0 elsewhere"
+        caption = f"Swap test, features: 1 is the distance of two images; {best}"
         decoded = zip(self.features, self.mean("swap.moved_parameters").tolist(), strict=True)
         return [
             ScoreTable(caption, "exchanged", [*columns, *ends], rows),
@@ -224,14 +222,11 @@ def disentangle(
     sizes = {name: values.shape[1] for name, values in embed_images(model, pixels[:1]).items()}
     correlations = kept.recall_one("card-correlation", inputs, lambda: correlation_matrix(features()))
 
-    @cache
-    def components() -> np.ndarray:
-        return pca_features(images, components=max(len(sizes), min(64, len(images) // 4))).concatenate()
-
-    def swapped(seed: int) -> np.ndarray:
-        return np.sort(np.random.default_rng(seed).permutation(len(pixels))[:swap_images])
-
-    tested = np.unique(np.concatenate(list(map(swapped, seeds))))  # whose encodings all seeds share
+    components = max(len(sizes), min(64, len(images) // 4))
+    whitened = cache(partial(pca_features, images, components=components))
+    orders = {seed: np.random.default_rng(seed).permutation(len(pixels)) for seed in seeds}
+    swapped = {seed: np.sort(order[:swap_images]) for seed, order in orders.items()}
+    tested = np.unique(np.concatenate(list(swapped.values())))  # whose encodings all seeds share
     encoded = cache(partial(unexchanged, model, pixels[tested], batch_size=batch_size))
 
     def made(row: str, seed: int) -> FeatureScores:
@@ -243,12 +238,13 @@ def disentangle(
             drawn = dealt(pixels.reshape(len(pixels), -1), list(sizes.values()), seed)
             blocks = {name: part.astype(np.float32) / 255 for name, part in zip(sizes, drawn, strict=True)}
         elif row == "PCA":
-            equal = [len(part) for part in np.array_split(components()[0], len(sizes))]
-            blocks = dict(zip(sizes, dealt(components(), equal, seed), strict=True))
+            values = whitened().concatenate()
+            equal = [len(part) for part in np.array_split(values[0], len(sizes))]
+            blocks = dict(zip(sizes, dealt(values, equal, seed), strict=True))
         else:
             blocks = features() if row == MODEL else shuffled_rows(features(), seed)
         if net is not None:
-            chosen, known = swapped(seed), None
+            chosen, known = swapped[seed], None
             if net is model:
                 places = np.searchsorted(tested, chosen)
                 known = [{key: each[places] for key, each in one.items()} for one in encoded()]

@@ -26,27 +26,20 @@ BINS = 20
 LASSO_PENALTIES = (0.5, 0.2, 0.1)  # a warm path to the last; as shares of the smallest one without a weight
 TOLERANCE = 1e-2  # of the duality gap, in units of the target's power
 
-_LIGHT, _CAMERA, _SHAPE = ("light",), ("camera",), ("geometry", "albedo")
-_KNOWN = {  # label: (name in tables, features that it belongs to)
-    "ambient": ("ambient", _LIGHT),
-    "diffuse": ("diffuse", _LIGHT),
-    "light_pitch_rad": ("light pitch", _LIGHT),
-    "light_yaw_rad": ("light yaw", _LIGHT),
-    "camera_x_rad": ("camera pitch", _CAMERA),
-    "camera_y_rad": ("camera yaw", _CAMERA),
-    "camera_z_rad": ("camera roll", _CAMERA),
-    "camera_tx": ("shift x", _CAMERA),
-    "camera_ty": ("shift y", _CAMERA),
-    "elevation_rad": ("elevation", _CAMERA),
-    "azimuth_rad": ("azimuth", _CAMERA),
-    "gloss_strength": ("gloss", ("specular",)),
-    "gloss_exponent": ("gloss exponent", ("specular",)),
-    "haze_beta": ("haze", ("haze",)),
-    "haze_airlight": ("airlight", ("haze",)),
-    "identity": ("identity", _SHAPE),
-    "expression": ("expression", _SHAPE),
-    "class": ("class", _SHAPE),
-}
+_KNOWN = {  # by the features that they belong to, labels and their names in tables
+    ("light",): {
+        "ambient": "ambient", "diffuse": "diffuse",
+        "light_pitch_rad": "light pitch", "light_yaw_rad": "light yaw",
+    },
+    ("camera",): {
+        "camera_x_rad": "camera pitch", "camera_y_rad": "camera yaw", "camera_z_rad": "camera roll",
+        "camera_tx": "shift x", "camera_ty": "shift y",
+        "elevation_rad": "elevation", "azimuth_rad": "azimuth",
+    },
+    ("specular",): {"gloss_strength": "gloss", "gloss_exponent": "gloss exponent"},
+    ("haze",): {"haze_beta": "haze", "haze_airlight": "airlight"},
+    ("geometry", "albedo"): {"identity": "identity", "expression": "expression", "class": "class"},
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -112,7 +105,10 @@ def true_factors(labels: Mapping[str, np.ndarray]) -> tuple[list[TrueFactor], di
     Left out are columns with missing values, one value or more classes than a fifth of the rows. A set
     without a column of light or camera is not a rendered one and has none.
     """
-    read = {_KNOWN[name][0]: _read(labels[name], *_KNOWN[name]) for name in _KNOWN if name in labels}
+    read: dict[str, TrueFactor | str] = {}
+    for features, names in _KNOWN.items():
+        here = {label: name for label, name in names.items() if label in labels}
+        read |= {name: _read(labels[label], name, features) for label, name in here.items()}
     factors = [one for one in read.values() if isinstance(one, TrueFactor)]
     if all(factor.is_class for factor in factors):
         return [], {}
@@ -146,8 +142,7 @@ def ground_truth_scores(
         weights, each = importance(everything, factors), binned(everything)
         single = np.stack([_explained(everything, factor) for factor in factors], axis=1)
         own_mig = float(np.mean([_information_gap(each, factor) for factor in factors]))
-        sap = float(np.mean(_gap(single)))
-        by_dimension = ModularityScores(*dci(weights), informativeness, own_mig, sap)
+        by_dimension = ModularityScores(*dci(weights), informativeness, own_mig, float(np.mean(_gap(single))))
     return GroundTruthScores(
         names,
         tuple(factor.name for factor in factors),
@@ -270,5 +265,4 @@ def _information_gap(bins: np.ndarray, factor: TrueFactor) -> float:
 
 def _gap(scores: np.ndarray) -> np.ndarray:
     """Best minus second best of each column of (D, K)."""
-    ordered = np.sort(scores, axis=0)
-    return ordered[-1] - ordered[-2]
+    return np.diff(np.sort(scores, axis=0)[-2:], axis=0)[0]

@@ -153,10 +153,8 @@ def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     blocks = {name: np.asarray(values, np.float64) for name, values in features.items()}
     lengths = sorted({len(values) for values in blocks.values()})
     if len(blocks) < 2 or len(lengths) != 1 or lengths[0] < 4:
-        raise ValueError(
-            f"scores between features need two or more of one number of rows, 4 or more; got {len(blocks)} "
-            f"features of {lengths} rows"
-        )
+        needed = "scores between features need two or more of one number of rows, 4 or more"
+        raise ValueError(f"{needed}; got {len(blocks)} features of {lengths} rows")
     check_finite(blocks, [f"row {row}" for row in range(lengths[0])])
     return blocks
 

@@ -51,8 +51,7 @@ class SwapScores:
     resampled: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
 
 
-Encodings = dict[str, Tensor]
-"""Features, decoded parameters and pixels of N images, by "feature NAME", "parameter NAME" and "pixels"."""
+Encodings = dict[str, Tensor]  # of N images, by "feature NAME", "parameter NAME" (decoded) and "pixels"
 
 
 def encodings(
@@ -91,9 +90,9 @@ def swap_test(
     """
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")
-    names, count = [factor.name for factor in model.factors], len(images)
+    features = [f"feature {factor.name}" for factor in model.factors]
     parameters = [factor.parameter for factor in model.factors]
-    donor = derangement(count, torch.Generator().manual_seed(seed))
+    donor = derangement(len(images), torch.Generator().manual_seed(seed))
     inputs, plain = known or unexchanged(model, images, batch_size=batch_size)
     scene = _decoded(inputs)
     exchanged = [scene.with_parameters(**{name: scene.parameters[name][donor]}) for name in parameters]
@@ -102,29 +101,28 @@ def swap_test(
     apart = _distances(plain, donors)
     unit = {key: each.mean() or np.nan for key, each in apart.items()}
     moves, left = ([_distances(each, other) for each in swapped] for other in (plain, donors))
-    weights = np.concatenate(list(resamples(count, RESAMPLES))).astype(np.float64)
+    weights = np.concatenate(list(resamples(len(images), RESAMPLES))).astype(np.float64)
 
-    def matrix(kind: str, of: Sequence[str]) -> tuple[np.ndarray, Any]:
+    def matrix(keys: Sequence[str]) -> tuple[np.ndarray, Any]:
         """(F, F) mean moves, and the ratio of its diagonal on resamples."""
-        keys = [f"{kind} {name}" for name in of]
         each = np.array([[row[key] for key in keys] for row in moves])
         between = np.stack([apart[key] for key in keys])
         with np.errstate(divide="ignore", invalid="ignore"):
             drawn = diagonal_over_rest((each @ weights.T) / (between @ weights.T))
         return each.mean(axis=2) / np.array([unit[key] for key in keys]), drawn
 
-    (moved, drawn), (decoded, drawn_decoded) = matrix("feature", names), matrix("parameter", parameters)
-    loss, own = _distances(plain, inputs), [f"feature {name}" for name in names]
+    (moved, drawn), loss = matrix(features), _distances(plain, inputs)
+    decoded, drawn_decoded = matrix([f"parameter {name}" for name in parameters])
     return SwapScores(
-        tuple(names),
+        tuple(factor.name for factor in model.factors),
         moved,
         decoded,
         np.array([row["pixels"].mean() / unit["pixels"] for row in moves]),
-        np.array([row[key].mean() / unit[key] for row, key in zip(left, own, strict=True)]),
-        np.array([loss[key].mean() / unit[key] for key in own]),
+        np.array([row[key].mean() / unit[key] for row, key in zip(left, features, strict=True)]),
+        np.array([loss[key].mean() / unit[key] for key in features]),
         float(diagonal_over_rest(moved)),
         float(diagonal_over_rest(decoded)),
-        count,
+        len(images),
         np.stack([drawn, drawn_decoded], axis=1),
     )
 
