@@ -61,10 +61,8 @@ def agreement_table(
     scores = {name: agreement(np.asarray(own, np.float64), true, weights) for name, own in answers.items()}
     rows = [ScoredRow(name, at > 0, 1, own) for at, (name, own) in enumerate(scores.items())]
     columns = {name: replace(one, digits=digits if one.digits == 2 else 3) for name, one in AGREEMENT.items()}
-    table = scored_table(
-        caption, "prediction", rows, columns, intervals=("r", "slope", "error"), deviations=()
-    )
-    return table, numbers_of(rows)
+    every: dict[str, Any] = {"intervals": ("r", "slope", "error"), "deviations": ()}
+    return scored_table(caption, "prediction", rows, columns, **every), numbers_of(rows)
 
 
 def pose(
@@ -171,10 +169,9 @@ def known_angles(
         )
         true = _spherical(light_in_camera(given, torch.nn.functional.pad(turned, (0, 3)))).numpy()
     else:
-        raise ValueError(
-            f"{images.source} has no labels {', '.join(labels.values())} (it has "
-            f"{', '.join(images.labels) or 'none'}): give a table with name, {', '.join(labels)}"
-        )
+        what, have = ", ".join(labels.values()), ", ".join(images.labels) or "none"
+        how = f"give a table with name, {', '.join(labels)}"
+        raise ValueError(f"{images.source} has no labels {what} (it has {have}): {how}")
     known = np.flatnonzero(np.isfinite(true).all(axis=1))
     if len(known) < 2:
         raise ValueError(f"{len(known)} images have known angles: two or more are needed")

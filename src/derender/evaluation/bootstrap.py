@@ -15,8 +15,7 @@ import numpy as np
 RESAMPLES = 1_000
 LEVEL = 0.95
 CHUNK_BYTES = 64 << 20
-Runs = Sequence[float] | np.ndarray
-"""A score of each run."""
+Runs = Sequence[float] | np.ndarray  # a score of each run
 NAN = float("nan")
 
 

@@ -78,8 +78,7 @@ def identify(
     scored, columns, probes = binned_rows(right, angle[probe], how.drawn(who[probe]), quiet, bins=bins)
     if 1 < len(set(who[near])) < near.sum():
         codes = {name: [run[near] for run in runs] for name, runs in ready.features.items()}
-        own = {"features": codes, "labels": {label: who[near]}, "controls": ready.controls}
-        result = compare_clusterings(**own, **how.scoring).rows
+        result = compare_clusterings(codes, {label: who[near]}, controls=ready.controls, **how.scoring).rows
         ward = {row.name: {f"ward {key}": row.scores[key] for key in ("accuracy", "nmi")} for row in result}
         both = [replace(row, scores={**row.scores, **ward[row.name]}) for row in scored]
         scored = bootstrap.with_verdicts(both)
@@ -206,10 +205,8 @@ def verify(
         known = features if isinstance(features, FeatureTable) else FeatureTable.read(str(features))
     stems = list(map(stem_of, known.files))
     if absent := sorted(names.difference(stems)):
-        raise ValueError(
-            f"{len(absent):,} of {len(names):,} images of the pairs are not there (first {absent[0]}): give "
-            "the images that the pairs were drawn from"
-        )
+        what = f"{len(absent):,} of {len(names):,} images of the pairs are not there (first {absent[0]})"
+        raise ValueError(f"{what}: give the images that the pairs were drawn from")
     chosen = known.select(np.array([stem in names for stem in stems]))
     if isinstance(chosen, FeatureTable):
         features = chosen
@@ -256,11 +253,8 @@ def _in_half(pairs: Pairs, half: str) -> Pairs:
     """The pairs whose people all lie in one half; in each fold as many of one person as of two, the first."""
     if half == "all":
         return pairs
-
-    def inside(name: str) -> bool:
-        return in_test_half(name.rpartition("_")[0]) == (half == "test")
-
-    own = np.array([inside(a) and inside(b) for a, b in zip(pairs.first, pairs.second, strict=True)])
+    people = ([name.rpartition("_")[0] for name in side] for side in (pairs.first, pairs.second))
+    own = np.all([[in_test_half(one) == (half == "test") for one in side] for side in people], axis=0)
     kept: list[int] = []
     for fold in np.unique(pairs.fold):
         both = [np.flatnonzero(own & (pairs.fold == fold) & (pairs.same == same)) for same in (True, False)]

@@ -27,7 +27,7 @@ from derender.evaluation.angles import agreement, agreement_table
 from derender.evaluation.bootstrap import Estimate, ScoredRow, estimate, numbers_of
 from derender.evaluation.image_scores import binned_rows, image_rows
 from derender.evaluation.options import Options
-from derender.evaluation.pixels import reconstruction_scores
+from derender.evaluation.pixels import ReconstructionScores, reconstruction_scores
 from derender.evaluation.scenes import optimised
 from derender.evaluation.score_table import Column, Scores, scored_table, verdict
 from derender.features import map_batches, missing
@@ -170,8 +170,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a - b, axis=1)
 
 
-BORDER = {"yaleb": (15 / 128, 21 / 128)}
-"""By layout, shares of rows and columns at each side that are no part of the photograph, but its edge."""
+BORDER = {"yaleb": (15 / 128, 21 / 128)}  # by layout, shares of rows and columns at each side that are edge
 NEEDED = ("identity", "light_azimuth_deg", "light_elevation_deg", "light_deg")
 CONTROLS = ("input", "mean image", "another person's ratio")
 
@@ -213,7 +212,7 @@ def relight(
     down, across = (round(share * photos.shape[-1]) for share in BORDER.get(read.layout, (0, 0)))
     photographed = torch.zeros(photos.shape[-2:])  # 1 where a photograph is not its border
     photographed[down : len(photographed) - down, across : len(photographed) - across] = 1
-    apart: dict[str, dict[str, list[np.ndarray]]] = {"PSNR": {}, "SSIM": {}}
+    apart: dict[str, list[ReconstructionScores]] = {}
     progress = how.stage("relighting", "people")
     for number, person in enumerate(people):
         progress(number + 1, len(people))
@@ -238,16 +237,15 @@ def relight(
         answers = (edited.image, rendered.image, *copied)
         for name, drawn in zip(("photograph relit", "model's rendering", *CONTROLS), answers, strict=True):
             shown, covered = drawn.float().cpu().clamp(0, 1), mask.expand(len(targets), -1, -1)
-            scores = reconstruction_scores(shown, photos[targets], covered)
-            apart["PSNR"].setdefault(name, []).append(scores.psnr_db_each)
-            apart["SSIM"].setdefault(name, []).append(scores.ssim_each)
+            apart.setdefault(name, []).append(reconstruction_scores(shown, photos[targets], covered))
     if not rows:
         raise ValueError("no two people have images in the same two lights: nothing to compare")
     tables, notes = [], list(how.notes)
     values: dict[str, Any] = {"pictures": len(rows), "people": len(set(who[rows]))}
     weights = how.drawn(who[rows])
-    for title, unit, digits in (("PSNR", "dB", 1), ("SSIM", "at most 1", 3)):
-        each = {name: np.concatenate(parts) for name, parts in apart[title].items()}
+    for title, score, unit, digits in (("PSNR", "psnr_db", "dB", 1), ("SSIM", "ssim", "at most 1", 3)):
+        parts = {name: [getattr(one, f"{score}_each") for one in scores] for name, scores in apart.items()}
+        each = {name: np.concatenate(own) for name, own in parts.items()}
         scored, columns, _ = binned_rows(each, off[rows], weights, CONTROLS, digits=digits)
         caption = f"Relighting, {title} ({unit}): {len(rows):,} images of {values['people']} people, by light"
         tables.append(scored_table(caption, "prediction", scored, columns, deviations=()))
