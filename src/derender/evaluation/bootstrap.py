@@ -16,7 +16,6 @@ RESAMPLES = 1_000
 LEVEL = 0.95
 CHUNK_BYTES = 64 << 20
 Runs = Sequence[float] | np.ndarray  # a score of each run
-NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: 
 def constant(runs: float | Runs, count: int = RESAMPLES) -> Estimate:
     """A score that does not depend on the rows drawn, such as a chance level: one, or one for each run."""
     value = float(np.mean(runs))
-    return Estimate(value, NAN, NAN, _deviation(np.atleast_1d(runs)), np.full(count, value))
+    return Estimate(value, np.nan, np.nan, _deviation(np.atleast_1d(runs)), np.full(count, value))
 
 
 def scored_row(name: str, control: bool, scores: Iterable[str], values: np.ndarray, **how: Any) -> ScoredRow:
@@ -134,7 +133,7 @@ def difference(ours: Estimate, rivals: Mapping[str, Estimate], *, lower: bool = 
     name = max(known, key=lambda rival: sign * rivals[rival].value)
     low, high = _interval(sign * (ours.resampled - rivals[name].resampled))
     if np.isnan(ours.low):
-        low = high = NAN
+        low = high = np.nan
     return Difference(name, sign * (ours.value - rivals[name].value), low, high, above=low > 0)
 
 
@@ -159,4 +158,4 @@ def _interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def _deviation(runs: Runs) -> float:
-    return float(np.std(runs, ddof=1)) if len(runs) > 1 else NAN
+    return float(np.std(runs, ddof=1)) if len(runs) > 1 else np.nan

@@ -86,10 +86,9 @@ def identify(
         columns |= {"ward accuracy": Column("Ward", "high", note=f"purity of {note}")}
         columns |= {"ward nmi": Column("Ward NMI", "high", note="normalised mutual information of the same")}
     people = len(set(who[probe]))
-    caption = (
-        f"Identification: {len(probe):,} probes of {people} people, gallery of {int(shown.sum())}, "
-        f"nearest by cosine{' less the mean of the gallery' if centred else ''}"
-    )
+    measure = "cosine less the mean of the gallery" if centred else "cosine"
+    sizes = f"{len(probe):,} probes of {people} people, gallery of {int(shown.sum())}"
+    caption = f"Identification: {sizes}, nearest by {measure}"
     asked = "Above the strongest control? (people are resampled together)"
     tables = judged_tables(caption, "features", scored, columns, asked, deviations=())
     files, numbers = [table.files[row] for row in np.flatnonzero(shown)], bootstrap.numbers_of(scored)
@@ -233,18 +232,14 @@ def verify(
     scored = bootstrap.with_verdicts([*scored, bootstrap.ScoredRow("chance", True, 1, by_chance)])
     error = Column("± SE", None, note="standard error of accuracy over folds")
     n_folds, n_same = len(set(pairs.fold.tolist())), int(pairs.same.sum())
-    caption = (
-        f"Verification: {n_same:,} pairs of one person, {len(pairs) - n_same:,} of two, {n_folds} folds, "
-        "threshold and mean from the other folds"
-    )
+    sizes = f"{n_same:,} pairs of one person, {len(pairs) - n_same:,} of two, {n_folds} folds"
+    caption = f"Verification: {sizes}, threshold and mean from the other folds"
     asked = "Above the strongest control? (paired resamples of pairs)"
     more = {error: lambda row: errors.get(row.name)}
     every: dict[str, Any] = {"intervals": tuple(columns), "deviations": (), "more": more}
     tables = judged_tables(caption, "features", scored, columns, asked, **every)
-    values = {
-        "pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half, "standard_error": errors,
-        "rows": bootstrap.numbers_of(scored),
-    }  # fmt: skip
+    values: dict[str, Any] = {"pairs": len(pairs), "folds": n_folds, "images": len(names), "half": half}
+    values |= {"standard_error": errors, "rows": bootstrap.numbers_of(scored)}
     notes = [*how.notes, verdict(scored[0], "accuracy", columns["accuracy"]), how.memory.summary()]
     return Scores(tables, values, notes, scored)
 

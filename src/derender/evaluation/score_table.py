@@ -6,10 +6,10 @@ A protocol gives ``Scores``: its tables (the main one first) and its numbers. ``
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite
+from math import isfinite, nan
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from derender.evaluation.bootstrap import NAN, ScoredRow
+from derender.evaluation.bootstrap import ScoredRow
 
 if TYPE_CHECKING:
     import pandas
@@ -96,10 +96,9 @@ class ScoreTable:
 
     def texts(self, row: Row) -> list[tuple[str, bool]]:
         """Each cell of a row as text, and whether it is the best of its column."""
-        return [
-            (column.text(cell), cell is not None and cell == self.best(place))
-            for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True))
-        ]
+        best = map(self.best, range(len(self.columns)))
+        cells = zip(self.columns, row.cells, best, strict=True)
+        return [(column.text(cell), cell is not None and cell == top) for column, cell, top in cells]
 
     def values(self) -> dict[str, dict[str, Cell]]:
         """Row name to column name to cell."""
@@ -141,7 +140,7 @@ class ScoreTable:
             cells = [row.cells[place] for row in self.rows]
             if any(isinstance(cell, Interval) for cell in cells):
                 for end in Interval._fields:
-                    data[f"{column.of} {end}".lstrip()] = [getattr(cell, end, NAN) for cell in cells]
+                    data[f"{column.of} {end}".lstrip()] = [getattr(cell, end, nan) for cell in cells]
             else:
                 data[f"{column.of} {column.name}".lstrip()] = cells
         names = pandas.Index([row.name for row in self.rows], name=self.first)

@@ -117,18 +117,13 @@ class DisentanglementCard:
     def tables(self) -> list[ScoreTable]:
         """The summary, the swap test's matrices, and where true factors are known the scores against them."""
         truth, seeds = self.rows[MODEL][0].truth, counted(len(self.rows[MODEL]), "seeds")
-        caption = (
-            f"Disentanglement: {', '.join(self.features)} of {self.n_pictures:,} images, mean over "
-            f"{seeds} of all pairs; low correlation alone proves nothing, read it with the swap test"
-        )
+        what = f"{', '.join(self.features)} of {self.n_pictures:,} images, mean over {seeds} of all pairs"
+        caption = f"Disentanglement: {what}; low correlation alone proves nothing, read it with the swap test"
         results = [self._means(caption, _SUMMARY), *self._swap_tables()]
         if truth is None:
             return results
-        caption = (
-            f"Whole features against {len(truth.factors)} true factors, best 1, mean over {seeds}; "
-            "where I is near 0, D and C are accidents"
-        )
-        results.append(self._means(caption, _WHOLE))
+        caption = f"Whole features against {len(truth.factors)} true factors, best 1, mean over {seeds}"
+        results.append(self._means(f"{caption}; where I is near 0, D and C are accidents", _WHOLE))
         if truth.by_dimension is not None:
             results.append(self._means(f"Single dimensions, as published, mean over {seeds}", _DIMENSIONS))
         together = {name: f"all, {name.split()[0]}" for name in self.rows} | {MODEL: "all"}
@@ -159,21 +154,17 @@ class DisentanglementCard:
         if self.mean("swap.moved") is None:
             return []
         columns = [Column(name, None, 2) for name in self.features]
-        ends = (
-            Column("picture", None, 2, "move of the pixels"),
-            Column("left", None, 2, "remaining distance from the exchanged feature to the donor's, best 0"),
-        )
+        left = "remaining distance from the exchanged feature to the donor's, best 0"
+        ends = Column("picture", None, 2, "move of the pixels"), Column("left", None, 2, left)
         cells = np.column_stack([self.mean(f"swap.{name}") for name in ("moved", "moved_pixels", "arrived")])
-        rows = [Row(*row) for row in zip(self.features, cells.tolist(), strict=True)]
+        rows = list(map(Row, self.features, cells.tolist()))
         loss = [*self.mean("swap.unexchanged").tolist(), None, None]
         rows.append(Row("nothing", loss, True, "from an image to its own rendering"))
         best = "best 1 for the one exchanged, 0 elsewhere"
         caption = f"Swap test, features: 1 is the distance of two images; {best}"
-        decoded = zip(self.features, self.mean("swap.moved_parameters").tolist(), strict=True)
-        return [
-            ScoreTable(caption, "exchanged", [*columns, *ends], rows),
-            ScoreTable("Swap test, decoded parameters", "exchanged", columns, [Row(*one) for one in decoded]),
-        ]
+        moved = list(map(Row, self.features, self.mean("swap.moved_parameters").tolist()))
+        decoded = ScoreTable("Swap test, decoded parameters", "exchanged", columns, moved)
+        return [ScoreTable(caption, "exchanged", [*columns, *ends], rows), decoded]
 
 
 def disentangle(
@@ -208,10 +199,8 @@ def disentangle(
     if not seeds:
         raise ValueError("the card needs at least one seed")
     pixels, (factors, unused) = images.images, ground_truth.true_factors(images.labels)
-    inputs = {
-        "weights": model_fingerprint(model), "settings": model.settings.model_dump(mode="json"),
-        "images": pixels, **{f"factor {factor.name}": factor.values for factor in factors},
-    }  # fmt: skip
+    facts = {"weights": model_fingerprint(model), "settings": model.settings.model_dump(mode="json")}
+    inputs = {**facts, "images": pixels, **{f"factor {factor.name}": factor.values for factor in factors}}
 
     @cache
     def features() -> dict[str, np.ndarray]:
