@@ -163,10 +163,9 @@ def known_angles(
         true = np.stack([images.labels[name].astype(np.float64) for name in labels.values()], axis=1)
         true = np.degrees(true) if next(iter(labels.values())).endswith("_rad") else true
     elif labels is LIGHT and {*rendered.LIGHT, *POSE.values()} <= set(images.labels):
-        given, turned = (
-            torch.from_numpy(np.stack([images.labels[name] for name in names], axis=1).astype(np.float32))
-            for names in (rendered.LIGHT, rendered.CAMERA[:3])
-        )
+        asked = rendered.LIGHT, rendered.CAMERA[:3]
+        stacked = (np.stack([images.labels[name] for name in names], axis=1) for names in asked)
+        given, turned = (torch.from_numpy(one.astype(np.float32)) for one in stacked)
         true = _spherical(light_in_camera(given, torch.nn.functional.pad(turned, (0, 3)))).numpy()
     else:
         what, have = ", ".join(labels.values()), ", ".join(images.labels) or "none"

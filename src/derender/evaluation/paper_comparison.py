@@ -64,14 +64,13 @@ def compare(
         if images is None or isinstance(images, ImageSet) or not models or len(models) < len(features):
             what = f"table {table!r} trains nets from a model's encoders, and features do not do"
             raise ValueError(f"{what}: give models and the address of images that have masks")
+        same: dict[str, Any] = {**options, "cache": how.memory, "masks": masks, "seeds": how.seeds(seeds)}
+        settings = SegmentSettings(epochs=epochs)
         tables, values = [], {}
         for name, (model, *others) in models.items():
             if others:
                 raise ValueError(f"two models have the name {name!r}: give each its own")
-            result = segment(
-                model, images, masks=masks, variants=PAPER_VARIANTS, seeds=how.seeds(seeds),
-                settings=SegmentSettings(epochs=epochs), **{**options, "cache": how.memory},
-            )  # fmt: skip
+            result = segment(model, images, variants=PAPER_VARIANTS, settings=settings, **same)
             shown = (result.tables[-1], *result.tables[:-1])
             tables += [replace(one, caption=f"{name}: {one.caption}") for one in shown]
             more = {"differs": result.result.differs, "paper": spec.parts[0].paper}
@@ -136,7 +135,7 @@ def compare(
                 beyond = "rows without a label or beyond its sizes left out"
                 notes.append(f"{part.name}: {ready.n_dropped:,} {beyond}")
         else:
-            also = {"models": models if finetune else None, "supervised": supervised}
+            also: dict[str, Any] = {"models": models if finetune else None, "supervised": supervised}
             result = compare_prepared(ready, counts, how.seeds(seeds), how, **also)
             more |= {"differs": part.differs(layout, len(ready.table))}
             caption = f"{part.name}: accuracy of the paper's head, {beside}"

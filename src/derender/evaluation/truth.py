@@ -154,10 +154,8 @@ def evaluate_geometry(
     check_size(model, truth.images, rendered=True)
     depth, mask = torch.as_tensor(truth.depth), torch.as_tensor(truth.mask) > 0
     normal = None if truth.normal is None else normalize(torch.as_tensor(truth.normal), dim=-1)
-
-    def score(predicted: Tensor, covered: Tensor) -> GeometryScores:
-        return geometry_scores(predicted, covered, depth, mask, model.fov_deg, normal)
-
+    known = {"depth_true": depth, "mask_true": mask, "fov_deg": model.fov_deg, "normal_true": normal}
+    score = partial(geometry_scores, **known)
     see = partial(predicted_depth, images=truth.images, batch_size=batch_size)
     everywhere = torch.ones_like(mask)
     return GeometryResult(
