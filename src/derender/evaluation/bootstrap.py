@@ -102,16 +102,16 @@ def estimate(runs: Runs, resampled: np.ndarray, *, centred: bool = False, most: 
     ``centred`` moves the resamples so that their mean is the value, and none exceeds ``most``. Scores of
     clusters need it: duplicated rows inflate purity.
     """
-    value = float(np.mean(runs))
+    value, deviation = float(np.mean(runs)), float(np.std(runs, ddof=1)) if len(runs) > 1 else np.nan
     if centred:
         resampled = np.minimum(resampled - resampled.mean() + value, most)
-    return Estimate(value, *_interval(resampled), _deviation(runs), resampled)
+    return Estimate(value, *_interval(resampled), deviation, resampled)
 
 
 def constant(runs: float | Runs, count: int = RESAMPLES) -> Estimate:
     """A score that does not depend on the rows drawn, such as a chance level: one, or one for each run."""
-    value = float(np.mean(runs))
-    return Estimate(value, np.nan, np.nan, _deviation(np.atleast_1d(runs)), np.full(count, value))
+    same = estimate(np.atleast_1d(runs), np.full(count, np.mean(runs)))
+    return replace(same, low=np.nan, high=np.nan)
 
 
 def scored_row(name: str, control: bool, scores: Iterable[str], values: np.ndarray, **how: Any) -> ScoredRow:
@@ -155,7 +155,3 @@ def with_verdicts(rows: Sequence[ScoredRow], *, lower: Collection[str] = ()) -> 
 def _interval(values: np.ndarray) -> tuple[float, float]:
     low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
-
-
-def _deviation(runs: Runs) -> float:
-    return float(np.std(runs, ddof=1)) if len(runs) > 1 else np.nan

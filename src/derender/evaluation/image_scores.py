@@ -118,7 +118,6 @@ def binned_rows(
 
 
 def _estimate(values: np.ndarray, weights: np.ndarray) -> bootstrap.Estimate:
-    values = np.asarray(values, np.float64)
     known = ~np.isnan(values)
     mean = values[known].mean() if known.any() else np.nan
     means = np.full(len(weights) - 1, np.nan)

@@ -93,12 +93,10 @@ def reconstruction(
     model = as_model(model, device=how.device)
     images = as_images(images, model.image_size, dataset=how.dataset, limit=how.limit)
     known = (training_images or images).images
-    make = partial(
-        pixels.evaluate_reconstruction, optimised(model, fit_steps), images.images,
-        mean=pixels.mean_image(known), batch_size=batch_size, progress=how.progress,
-        components_of=known[evenly_spaced(len(known), pixels.COMPONENT_IMAGES)],
-        untrained=untrained_twin(model, how.seed),
-    )  # fmt: skip
+    same: dict[str, Any] = {"batch_size": batch_size, "untrained": untrained_twin(model, how.seed)}
+    fitted = known[evenly_spaced(len(known), pixels.COMPONENT_IMAGES)]
+    same |= {"mean": pixels.mean_image(known), "components_of": fitted, "progress": how.progress}
+    make = partial(pixels.evaluate_reconstruction, optimised(model, fit_steps), images.images, **same)
     inputs = {"images": images.images, "fitted": known, "seed": how.seed, "steps": fit_steps or 0}
     result = _scored(model, {"reconstruction": (pixels.ReconstructionResult, make)}, inputs, how)
     intervals = result.values["intervals"]["reconstruction"]
