@@ -63,7 +63,7 @@ def test_folding_the_normalisation_changes_nothing(generator):
             layers(torch.rand(8, 3, 16, 12, generator=generator))
         layers.eval()
         images = torch.rand(2, 3, 16, 12, generator=generator)
-        folded = self_features.without_normalisation(layers, widths)
+        folded = self_features.without_normalisation(layers)
         torch.testing.assert_close(folded(images), layers(images), rtol=1e-4, atol=1e-5)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in folded)
 

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Generator, Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from derender.objectives.loocc import nt_xent
 from derender.objectives.perceptual import CALIBRATION_IMAGES, PerceptualFeatures
@@ -75,17 +76,15 @@ def trunk(widths: tuple[int, int, int], normalised: bool) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-@torch.no_grad()
-def without_normalisation(normalised: nn.Sequential, widths: tuple[int, int, int]) -> nn.Sequential:
-    """What the trained layers compute in evaluation mode, every BatchNorm folded into its convolution."""
-    folded = trunk(widths, normalised=False)
-    kinds = (folded, nn.Conv2d), (normalised, nn.Conv2d), (normalised, nn.BatchNorm2d)
-    rows: list[list[Any]] = [[layer for layer in layers if isinstance(layer, kind)] for layers, kind in kinds]
-    for target, convolution, norm in zip(*rows, strict=True):
-        gain = norm.weight / (norm.running_var + norm.eps).sqrt()
-        target.weight.copy_(convolution.weight * gain.view(-1, 1, 1, 1))
-        target.bias.copy_(norm.bias - norm.running_mean * gain)
-    return folded
+def without_normalisation(network: nn.Sequential) -> nn.Sequential:
+    """What layers in evaluation mode compute, every BatchNorm folded into the convolution before it."""
+    folded: list[Any] = []
+    for layer in network:
+        if isinstance(layer, nn.BatchNorm2d):
+            folded[-1] = fuse_conv_bn_eval(folded[-1], layer)
+        else:
+            folded.append(layer)
+    return nn.Sequential(*folded)
 
 
 @dataclass(frozen=True)
@@ -149,7 +148,7 @@ def train_self_features(
     if not all(bool(value.isfinite().all()) for value in layers.state_dict().values()):
         ended = f"learning perceptual features ended in weights that are NaN or infinite after {steps} steps"
         raise ValueError(f"{ended}: give another seed, or perceptual=none")
-    net.features.load_state_dict(without_normalisation(layers.cpu().eval(), settings.widths).state_dict())
+    net.features.load_state_dict(without_normalisation(layers.cpu().eval()).state_dict())
     rows = torch.randperm(len(images), generator=generator)[:CALIBRATION_IMAGES]
     net.calibrate_(images[rows].float() / 255)
     return net

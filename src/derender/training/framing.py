@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Generator, Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, affine_grid, avg_pool2d, gaussian_nll_loss, grid_sample
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from derender.data import Progress
 from derender.model import Derenderer
+from derender.objectives.self_features import without_normalisation
 from derender.postprocess.framing import HIDDEN, SIDE, STRIDES, UNIT, WIDTHS, Framing, limited, standardised
 from derender.scene.crop import back, crop_images, similarities
 from derender.scene.perturb import PerturbSettings
@@ -56,7 +56,9 @@ def fit_framing(
         optimiser.step()
         if progress is not None:
             progress(min((step + 1) * BATCH, crops), crops)
-    return Framing(_folded(network.eval()))
+    layers = [layer.state_dict() for layer in without_normalisation(network.eval()) if layer.state_dict()]
+    named = ((f"{name}{place}", value) for place, state in enumerate(layers) for name, value in state.items())
+    return Framing({name: value.cpu() for name, value in named})
 
 
 def _examples(
@@ -115,13 +117,3 @@ def _network() -> nn.Sequential:
     cells = (SIDE // math.prod(STRIDES)) ** 2
     ends = nn.Linear(WIDTHS[-1] * cells, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 8)
     return nn.Sequential(*layers, nn.Flatten(), *ends)
-
-
-def _folded(network: nn.Sequential) -> dict[str, Tensor]:
-    """The layers of a trained network, batch normalisation folded into the convolution before it."""
-    convolutions = [layer for layer in network if isinstance(layer, nn.Conv2d)]
-    norms = [layer for layer in network if isinstance(layer, nn.BatchNorm2d)]
-    layers = [fuse_conv_bn_eval(one, norm) for one, norm in zip(convolutions, norms, strict=True)]
-    layers += [layer for layer in network if isinstance(layer, nn.Linear)]
-    named = ((place, layer.state_dict()) for place, layer in enumerate(layers))
-    return {f"{name}{place}": value.cpu() for place, state in named for name, value in state.items()}
