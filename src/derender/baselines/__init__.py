@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from derender.features import Embedded
 
-NETWORKS: Mapping[str, str] = {
+NETWORKS: Mapping[str, str] = {  # classes of those with a network, as ``module.name`` in this package
     "vqvae": "autoencoders.Vqvae",
     "simclr": "simclr.Simclr",
     "ae": "autoencoders.Autoencoder",
@@ -25,9 +25,7 @@ NETWORKS: Mapping[str, str] = {
     "dinov2": "dinov2.Dinov2",
     "untrained": "controls.Untrained",
 }
-"""Classes of those with a network, as ``module.name`` in this package."""
-CONTROLS = ("pixels", "pca", "gradientfaces", "hog", "lbp", "noise")
-"""Those without: `control_features` makes their tables."""
+CONTROLS = ("pixels", "pca", "gradientfaces", "hog", "lbp", "noise")  # without a network (`control_features`)
 BASELINES = (*NETWORKS, *CONTROLS)
 TRAINED = tuple(name for name in NETWORKS if name not in ("dinov2", "untrained"))
 _HOME = {

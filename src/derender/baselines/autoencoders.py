@@ -26,8 +26,7 @@ from derender.networks.encoders import Encoder, NetworkSettings
 from derender.settings import Settings
 from derender.storage.places import optional
 
-Grid = Float[Tensor, "n d gh gw"]
-"""One vector for each of the places of a grid."""
+Grid = Float[Tensor, "n d gh gw"]  # one vector for each of the places of a grid
 
 
 class AutoencoderSettings(base.BaselineSettings):

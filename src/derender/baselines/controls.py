@@ -22,8 +22,7 @@ from derender.storage.places import optional
 
 ORIENTATIONS, BLOCK_CELLS, CELL_PX = 9, 2, 8
 BLUR_PX = 0.75
-LUMINANCE = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in brightness (ITU-R BT.601)."""
+LUMINANCE = (0.299, 0.587, 0.114)  # weights of red, green and blue in brightness (ITU-R BT.601)
 UNIFORM_PATTERNS = 59
 
 
@@ -123,8 +122,7 @@ DESCRIPTORS: Mapping[str, tuple[Callable[[np.ndarray], np.ndarray], Mapping[str,
     "gradientfaces": (gradientfaces, {"blur_px": BLUR_PX}),
     "hog": (hog, {"orientations": ORIENTATIONS, "cell_px": CELL_PX, "block": BLOCK_CELLS}),
     "lbp": (lbp, {"cell_px": CELL_PX}),
-}
-"""Controls that describe each image by itself, and know nothing of others; and the facts of their tables."""
+}  # controls that describe each image by itself, and know nothing of others; and the facts of their tables
 
 
 def descriptor_features(name: str, images: ImageSet, *, progress: Progress | None = None) -> FeatureTable:

@@ -24,20 +24,14 @@ from torch.nn.functional import conv2d, conv_transpose2d, leaky_relu, linear
 
 from derender.baselines.model import BaselineSettings, Images
 
-FILTER = (0.125, 0.375, 0.375, 0.125)
-"""Binomial taps that every change of resolution goes through; they add up to 1."""
+FILTER = (0.125, 0.375, 0.375, 0.125)  # binomial taps of every change of resolution; they add up to 1
 TINY = 1e-8
-SLOPE, GAIN = 0.2, sqrt(2)
-"""Of the leaky ReLU, and the gain that keeps its output's variance about 1."""
+SLOPE, GAIN = 0.2, sqrt(2)  # of the leaky ReLU, and the gain that keeps its output's variance about 1
 
-Maps = Float[Tensor, "n _ _ _"]
-"""Any number of channels and any size."""
-Codes = Float[Tensor, "n codes d"]
-"""W+."""
-Styles = Sequence[Float[Tensor, "n _"]]
-"""Style space, one matrix for each steered layer."""
-Noise = Sequence[Tensor] | None
-"""One (m, 1, r, r) map for every styled convolution, m = 1 or the number of images; None is no noise."""
+Maps = Float[Tensor, "n _ _ _"]  # any number of channels and any size
+Codes = Float[Tensor, "n codes d"]  # W+
+Styles = Sequence[Float[Tensor, "n _"]]  # style space, one matrix for each steered layer
+Noise = Sequence[Tensor] | None  # a (m, 1, r, r) map for every styled convolution, m = 1 or n; None: no noise
 
 
 def _power_of_two(side: int) -> int:
@@ -46,8 +40,7 @@ def _power_of_two(side: int) -> int:
     return side
 
 
-Side = Annotated[int, AfterValidator(_power_of_two)]
-"""Of images, in pixels."""
+Side = Annotated[int, AfterValidator(_power_of_two)]  # of images, in pixels
 
 
 class GeneratorSettings(BaselineSettings):

@@ -32,10 +32,8 @@ from derender.training.derender_task import self_features_of
 from derender.training.loop import train_task
 
 PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
-OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")
-"""Numbers that ``losses`` returns beside the losses."""
-Images = Float[Tensor, "n 3 h w"]
-"""Images, in 0..1 where nothing else is said."""
+OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")  # numbers that ``losses`` returns beside the losses
+Images = Float[Tensor, "n 3 h w"]  # images, in 0..1 where nothing else is said
 Features = dict[str, Float[Tensor, "n _"]]
 
 

@@ -35,14 +35,13 @@ from derender.training.task import TrainResult
 
 COARSE_LAYERS = 4  # styles at 4 and 8 pixels, before the first that paints 8 pixels' colours
 HAIR, POSE = "hair", "pose"
-FACE_PARTS = {
+FACE_PARTS = {  # CelebAMask-HQ's classes as eight parts; other classes keep their names
     **dict.fromkeys(("l_ear", "r_ear", "ear_r"), "ears"),
     **dict.fromkeys(("l_eye", "r_eye", "l_brow", "r_brow", "eye_g"), "eyes"),
     **dict.fromkeys(("mouth", "u_lip", "l_lip"), "mouth"),
     **dict.fromkeys(("neck", "neck_l", "cloth"), "neck"),
     "hat": "hair",
 }
-"""CelebAMask-HQ's classes as eight parts; other classes keep their names."""
 BATCH = 16
 Parts = Float[Tensor, "n p h w"]  # how much of each place every part has, 0..1
 

@@ -23,8 +23,7 @@ from derender.settings import Names, Settings
 from derender.storage.places import optional
 from derender.training.task import TrainResult
 
-Classes = dict[str, tuple[str, ...]]
-"""Class names of every label column."""
+Classes = dict[str, tuple[str, ...]]  # class names of every label column
 MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)
 """Views of labelled images: a little crop, flip and jitter."""
 

@@ -19,10 +19,8 @@ from derender.training.loop import train_task
 from derender.training.run_folder import read_settings, refuse_taken
 from derender.training.task import Progress, TrainResult
 
-OnImages = Callable[[ImageSet], object]
-"""Called with the images once they are read."""
-Changes = Mapping[str, Any] | Sequence[str]
-"""Settings by dotted name, or ``key=value`` texts."""
+OnImages = Callable[[ImageSet], object]  # called with the images once they are read
+Changes = Mapping[str, Any] | Sequence[str]  # settings by dotted name, or ``key=value`` texts
 
 
 def run_settings(

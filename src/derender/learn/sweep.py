@@ -51,8 +51,7 @@ SUMMARY = {
     "linear": ("Few labels, penalised logistic regression", {BALANCED: LINEAR_COLUMNS[BALANCED]}),
 }
 DONE, TO_DO, FAILED = "done", "to do", "failed: "
-Show = Callable[..., None]
-"""Called with (done, total), perhaps a note, ``description=`` and ``unit=``."""
+Show = Callable[..., None]  # called with (done, total), perhaps a note, ``description=`` and ``unit=``
 
 
 def no_bar(text: str, unit: str) -> AbstractContextManager[Show]:

@@ -165,8 +165,7 @@ def _vector_net(numbers: int, settings: NetworkSettings) -> FactorNet:
     return FactorNet(encoder, VectorDecoder(settings.code_size, numbers))
 
 
-GEOMETRY_START = 0.1
-"""Scale of the first weights of geometry's last layer: depth begins almost flat. Runs may set another."""
+GEOMETRY_START = 0.1  # of geometry's last layer's first weights: depth begins almost flat; runs may differ
 
 FACTORS = (
     Factor("geometry", "depth", map_net(1, GEOMETRY_START), depth_from_raw, mirrored=True, perturb=exchange),

@@ -26,8 +26,7 @@ from derender.storage.tensors import check_pickle, require_plain
 
 NETS = {"netD": "geometry", "netA": "albedo", "netL": "light", "netV": "camera", "netC": "confidence"}
 OPTIONAL = "netC"
-MOST_UNKNOWN = 50
-"""Kinds of objects in one file."""
+MOST_UNKNOWN = 50  # kinds of objects in one file
 
 
 class Empty:

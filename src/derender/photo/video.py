@@ -34,8 +34,7 @@ SMOOTH_SECONDS = {"place": 0.15, "depth": 0.5, "albedo": 0.5, "light": 0.3, "cam
 LONGEST_FRAMES = 18_000
 BATCH = 64
 
-Edit = Callable[[Scene], Mapping[str, Tensor]]
-"""From the scenes of all frames to parameters (a row for each frame) in place of theirs."""
+Edit = Callable[[Scene], Mapping[str, Tensor]]  # all frames' scenes to parameters, a row each, in their place
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ WORKS_ON = {"numba": "cpu", "triton": "cuda"}
 INSTALLED = {name: importlib.util.find_spec(name) is not None for name in WORKS_ON}
 """Found at import, as torch 2.6 cannot trace it."""
 BACKENDS = ("auto", "reference", *WORKS_ON)
-FEW_PIXELS = 4 * 64 * 64
-"""So many, without gradients, are the reference's on a CPU: Numba takes half a second to start."""
+FEW_PIXELS = 4 * 64 * 64  # without gradients the reference's on a CPU: Numba takes half a second to start
 
 
 def available_backends() -> tuple[str, ...]:

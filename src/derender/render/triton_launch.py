@@ -15,19 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-INTERPRETED_BLOCK = 4096
-"""Lanes per program in the interpreter, whose time goes by operations and hardly by lanes."""
+INTERPRETED_BLOCK = 4096  # lanes per program in the interpreter: its time goes by operations, hardly by lanes
 
 PIXELS_PER_PROGRAM = 128
-TRIANGLES_PER_PROGRAM = 32
-"""One warp: lanes wait for the largest triangle among them, so there should be few."""
+TRIANGLES_PER_PROGRAM = 32  # one warp: lanes wait for the largest triangle among them, so there should be few
 
-ADD, MEASURE, ADD_INTEGERS = 0, 1, 2
-"""What a kernel is asked to do: its ``MODE``."""
+ADD, MEASURE, ADD_INTEGERS = 0, 1, 2  # what a kernel is asked to do: its ``MODE``
 
 LARGEST_SUM = 2.0**62
-SMALLEST_SUMMAND = 1e-280
-"""Images whose every summand is smaller get zeros: the unit would not be finite."""
+SMALLEST_SUMMAND = 1e-280  # images whose every summand is smaller get zeros: the unit would not be finite
 
 Run = Callable[[int, Tensor, Tensor, Sequence[Tensor]], None]
 

@@ -95,13 +95,12 @@ def write_curves(result: RobustnessComparison, score: str, file: Path) -> None:
     write_whole(file, png if file.suffix.lower() == ".png" else svg.encode())
 
 
-FACE_PALETTE = (
+FACE_PALETTE = (  # red, green, blue of CelebAMask-HQ's 19 classes in their order
     *((38, 40, 46), (240, 178, 140), (214, 112, 64), (122, 86, 196), (66, 134, 244), (120, 186, 255)),
     *((20, 120, 80), (64, 190, 130), (226, 160, 30), (252, 206, 92), (120, 8, 40), (228, 26, 74)),
     *((252, 108, 150), (104, 62, 30), (150, 150, 156), (255, 245, 60), (0, 206, 209), (198, 148, 170)),
     (70, 92, 120),
 )
-"""Red, green, blue of CelebAMask-HQ's 19 classes in their order."""
 
 OPACITY = 0.62
 

@@ -55,8 +55,7 @@ EXAMINED, SCORED, CARD, EXPLAINED = 1_500, 200, 200, 400  # images each part loo
 SHOWN, FILMED, TRUTH_SHOWN = 5, 2, 100
 FEWEST_OF_A_CLASS, MOST_CLASSES = 10, 12
 
-Values = dict[str, Any]
-"""What a section of ``templates/run.html`` shows, by name."""
+Values = dict[str, Any]  # what a section of ``templates/run.html`` shows, by name
 
 
 @dataclass(frozen=True)

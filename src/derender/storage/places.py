@@ -19,11 +19,10 @@ TENSOR_FILES = (WEIGHTS_FILE, WHITENING_FILE, FITTING_FILE)
 TEXT_FILES = (CARD_FILE, ERRORS_FILE, SPLIT_FILE)
 DEVICES = ("auto", "cpu", "cuda")
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
-SUFFIXES = (
+SUFFIXES = (  # file names that end in one of these are taken for images
     *(".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".bmp", ".gif"),
     *(".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".heic", ".heif"),
 )
-"""File names that end in one of these are taken for images."""
 
 
 def optional(package: str, needed_for: str, extra: str = "baselines") -> Any:

@@ -182,11 +182,10 @@ class FinetuneConfig(TrainConfig):
     checkpoint_every: int = Field(default=5_000, ge=1)
 
 
-REMOVED: dict[str, Any] = {
+REMOVED: dict[str, Any] = {  # of earlier versions: runs with them at this value (...: at any) still load
     "objective.loocc_after": 0.0, "reframe": ..., "reframed": 0.0, "whitening.frames": 0,
     "whitening.reframe": ...,
 }  # fmt: skip
-"""Settings of earlier versions: runs that have them at this value (...: at any) still load."""
 
 _CHANGES = table_beside(__file__, "presets.yaml")
 PRESETS: dict[str, TrainConfig] = {

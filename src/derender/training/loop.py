@@ -31,8 +31,7 @@ from derender.training.watch import Finding, largest_gradients, not_finite
 
 SAMPLE_COUNT = 8
 LOG_EVERY_STEPS = 50
-READ_EVERY_STEPS = 16
-"""Steps after which the host reads the notes of all of them; between, it never waits for the device."""
+READ_EVERY_STEPS = 16  # steps whose notes the host reads at once; between, it never waits for the device
 MAX_VALIDATION_IMAGES = 1_000
 FIRST_KEPT_IMAGES = 300  # about when the first state of a run with long intervals is kept
 NOT_RECONSTRUCTION = ("l1", "loocc", "cycle")

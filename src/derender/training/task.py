@@ -32,8 +32,7 @@ class StepLosses:
     terms: dict[str, Tensor]
 
 
-Losses = Callable[..., StepLosses]
-"""Of one batch, from the arguments of `compute_step` after the module."""
+Losses = Callable[..., StepLosses]  # of one batch, from the arguments of `compute_step` after the module
 
 
 class Step(nn.Module):

@@ -113,5 +113,4 @@ def _triton_backward(*values: Any) -> tuple[Tensor, ...]:
 
 FORWARD = operators(
     "warp", "warping", ("image", "depth", "rotation", "offset"), _room, 2, _triton, _triton_backward
-)
-"""By backend: image, depth, rotation, offset (float64), focal length to image, depth, mask, triangle."""
+)  # by backend: image, depth, rotation, offset (float64), focal length to image, depth, mask, triangle

@@ -32,8 +32,7 @@ from derender.report.viewer.questions import BODY_LIMIT_BYTES, Question, Refused
 from derender.report.viewer.server import Guard
 from derender.report.viewer.studio import Studio
 
-LONG_WORK = 6
-"""Opening, which fits, and films may take so many times as long as other answers."""
+LONG_WORK = 6  # opening, which fits, and films may take so many times as long as other answers
 
 REQUEST_LIMIT_BYTES = 10_000
 

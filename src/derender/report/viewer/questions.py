@@ -21,8 +21,7 @@ from derender.settings import Settings
 
 LARGEST_SIZE = 1024
 BODY_LIMIT_BYTES = 20_000_000
-PIXEL_LIMIT = 40_000_000
-"""Fewer than any decompression bomb needs, more than most cameras take."""
+PIXEL_LIMIT = 40_000_000  # fewer than any decompression bomb needs, more than most cameras take
 
 KINDS = "JPEG, PNG, WebP, AVIF, BMP, GIF, TIFF, PPM"
 
