@@ -39,10 +39,9 @@ def as_model(
         source, loaded = str(model), load(model, device=device_named(device))
         for name, value in loaded.state_dict().items():
             if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise ValueError(
-                    f"{source} has weights that are NaN or infinite (first {name}): its training went wrong "
-                    "or the file is damaged; take another checkpoint or train again"
-                )
+                what = f"{source} has weights that are NaN or infinite (first {name})"
+                why = "its training went wrong or the file is damaged"
+                raise ValueError(f"{what}: {why}; take another checkpoint or train again")
     if fit_steps is not None and (fit_steps or loaded.fitting is not None):
         loaded.features.required_fitting(source)
         loaded = loaded.with_features(loaded.features.with_steps(fit_steps))

@@ -108,10 +108,9 @@ def maker_of(table: FeatureTable, model: Any, name: str = "the table", *, device
         net = as_model(net, fit_steps=max(0, steps))
     made_by, weights = table.origin.get("weights"), model_fingerprint(net)
     if made_by not in (None, weights):
-        raise ValueError(
-            f"{name} was made by another model (weights {made_by}, {source} has {weights}): "
-            "give that one, or make the table again with derender embed"
-        )
+        fix = "give that one, or make the table again with derender embed"
+        differ = f"weights {made_by}, {source} has {weights}"
+        raise ValueError(f"{name} was made by another model ({differ}): {fix}")
     return net
 
 

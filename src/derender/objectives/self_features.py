@@ -56,9 +56,8 @@ def load_self_features(path: Path | str) -> SelfFeatures:
         net = SelfFeatures(parse_json(metadata["widths"], tuple[int, int, int]))
         net.load_state_dict(tensors)
     except (RuntimeError, ValueError, TypeError) as problem:
-        raise ValueError(
-            f"{path} does not fit its own widths; delete it, and they are learnt again"
-        ) from problem
+        fix = "delete it, and they are learnt again"
+        raise ValueError(f"{path} does not fit its own widths; {fix}") from problem
     return net
 
 

@@ -67,11 +67,9 @@ class Aligned:
     def describe(self) -> str:
         """One line."""
         n = self.counts
-        return (
-            f"{counted(n['faces'], 'faces')} in {counted(n['photographs'], 'photographs')}; no face in "
-            f"{n['without_face']:,}, {n['rejected']:,} rejected, {n['unreadable']:,} unreadable "
-            f"({BOXES} names each)"
-        )
+        faces = f"{counted(n['faces'], 'faces')} in {counted(n['photographs'], 'photographs')}"
+        rest = f"{n['rejected']:,} rejected, {n['unreadable']:,} unreadable ({BOXES} names each)"
+        return f"{faces}; no face in {n['without_face']:,}, {rest}"
 
 
 def align(
@@ -245,9 +243,8 @@ def _read(file: Path) -> tuple[dict[str, Any] | None, list[dict[str, str]]]:
         if any(None in row or None in row.values() for row in rows):
             raise ValueError("a row is longer or shorter than the first")
     except (ValueError, csv.Error) as error:
-        raise ValueError(
-            f"{file} is no table of derender align ({first_line(error)}): choose another folder"
-        ) from error
+        what = f"{file} is no table of derender align ({first_line(error)})"
+        raise ValueError(f"{what}: choose another folder") from error
     last = rows[-1]["photo"] if rows and plan is not None else None
     return plan, [row for row in rows if row["photo"] != last]
 

@@ -73,10 +73,9 @@ class PhotoDetail:
         renderer: Renderer = LAMBERT, visible: tuple[slice, slice] = (slice(None), slice(None)),
     ):  # fmt: skip
         if len(scene) != 1 or photo.ndim != 3 or photo.shape[-1] < scene.depth.shape[-1]:
-            raise ValueError(
-                f"a photograph (3, S, S) and its one scene are needed, S no smaller than the scene; got "
-                f"{tuple(photo.shape)} and {len(scene)} scenes of {scene.depth.shape[-1]} pixels"
-            )
+            got = f"{tuple(photo.shape)} and {len(scene)} scenes of {scene.depth.shape[-1]} pixels"
+            needed = "a photograph (3, S, S) and its one scene are needed, S no smaller than the scene"
+            raise ValueError(f"{needed}; got {got}")
         self.photo, self.fov_deg, self.model_size = photo.to(scene.depth), fov_deg, scene.depth.shape[-1]
         self.size, self.span, self.visible = photo.shape[-1], 1 + 2 * margin, visible
         self.grid = min(max(GRID, self.model_size), self.size)

@@ -84,10 +84,8 @@ class Features:
         """The fitting, or an error that names how to get one."""
         if self.fitting is None:
             name = model if model != "this model" else "MODEL"
-            raise ValueError(
-                f"{model} cannot optimise scenes per image yet: derender whiten --model {name} IMAGES --out "
-                "NEW makes a copy that can"
-            )
+            fix = f"derender whiten --model {name} IMAGES --out NEW makes a copy that can"
+            raise ValueError(f"{model} cannot optimise scenes per image yet: {fix}")
         return self.fitting
 
     def with_steps(self, steps: int) -> "Features":

@@ -170,10 +170,8 @@ class Whitening(nn.Module):
         size, mirrored = self.size(name), name in self.mirrored
         needed = size * (2 if mirrored else 1)
         if activations.shape[1] < needed:
-            raise ValueError(
-                f"features of {name} are made of {needed:,} numbers, got {activations.shape[1]:,}: "
-                "give what model.activations gives, not codes"
-            )
+            got = f"got {activations.shape[1]:,}: give what model.activations gives, not codes"
+            raise ValueError(f"features of {name} are made of {needed:,} numbers, {got}")
         if mirrored:
             activations = activations.unflatten(1, (2, -1)).mean(dim=1)
         return (activations[:, -size:] if name in self.moved else activations[:, :size]).float()

@@ -280,9 +280,8 @@ def _require_free(folders: Sequence[Path], out: Path, sheet: bool, force: bool) 
     sheets = _sheet_files(out, len(folders)) if sheet else []
     existing = [place for place in (*folders, *sheets) if place.exists()]
     if existing and not force:
-        raise FileExistsError(
-            f"{existing[0]} exists already: choose another --out, or add --force to replace it"
-        )
+        fix = "choose another --out, or add --force to replace it"
+        raise FileExistsError(f"{existing[0]} exists already: {fix}")
 
 
 def _sheet_files(out: Path, count: int) -> list[Path]:

@@ -143,10 +143,8 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
     inside[:, :border_columns] = inside[:, width - 1 - border_columns :] = False
     surface = _largest_piece((inside & _facing(points, grazing_deg)).numpy())
     if not surface.any():
-        raise ValueError(
-            f"nothing of this surface is seen at less than {grazing_deg:g} degrees: allow more, or see "
-            "whether the model was trained"
-        )
+        fix = "allow more, or see whether the model was trained"
+        raise ValueError(f"nothing of this surface is seen at less than {grazing_deg:g} degrees: {fix}")
     row, column = np.nonzero(surface)
     a = row * width + column
     b, c, d = a + width, a + 1, a + width + 1

@@ -151,10 +151,8 @@ class Crop:
     def __post_init__(self):
         room = 1 - self.side + 1e-9
         if not (0 < self.side <= 1 and abs(self.across) <= room and abs(self.down) <= room):
-            raise ValueError(
-                f"a crop lies inside the image: 0 < side <= 1 and its centre within 1 - side of the middle, "
-                f"got {self}"
-            )
+            needed = "0 < side <= 1 and its centre within 1 - side of the middle"
+            raise ValueError(f"a crop lies inside the image: {needed}, got {self}")
 
     def corner(self, size: int) -> tuple[int, int, int]:
         """Left, top and side in pixels, in an image of ``size``."""

@@ -54,10 +54,8 @@ def read_config(folder: Path) -> dict[str, Any]:
     config = saved_config(folder)
     if "baseline" in config:
         name = config["baseline"]
-        raise ValueError(
-            f"{folder} holds the baseline {name!r}, not our model: add --baseline {name}, or load it with "
-            "derender.baselines.load_baseline"
-        )
+        fix = f"add --baseline {name}, or load it with derender.baselines.load_baseline"
+        raise ValueError(f"{folder} holds the baseline {name!r}, not our model: {fix}")
     names = config.get("factors")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{folder / CONFIG_FILE} is damaged: copy or train the model again")

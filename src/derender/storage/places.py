@@ -30,10 +30,8 @@ def optional(package: str, needed_for: str, extra: str = "baselines") -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ValueError(
-            f"{needed_for} needs the package {package.split('.')[0]}, which is not here ({error}): "
-            f"pip install 'derender[{extra}]'"
-        ) from error
+        what = f"{needed_for} needs the package {package.split('.')[0]}, which is not here ({error})"
+        raise ValueError(f"{what}: pip install 'derender[{extra}]'") from error
 
 
 def bundled_models() -> tuple[str, ...]:
@@ -67,18 +65,16 @@ def model_folder(source: str | Path) -> Path:
         if (candidate / CONFIG_FILE).is_file() and (candidate / WEIGHTS_FILE).is_file():
             return candidate
     if folder.exists():
-        raise FileNotFoundError(
-            f"{folder} holds no model (expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'): "
-            "give a run folder made by 'derender train' or a folder made by model.save"
-        )
+        missing = f"expected {CONFIG_FILE} and {WEIGHTS_FILE} here or in 'model'"
+        fix = "give a run folder made by 'derender train' or a folder made by model.save"
+        raise FileNotFoundError(f"{folder} holds no model ({missing}): {fix}")
     if source in bundled_models():
         return PRETRAINED / source
     if hub_id(str(source)):
         return downloaded(str(source), (CONFIG_FILE, *TENSOR_FILES, *TEXT_FILES))
-    raise FileNotFoundError(
-        f"no model at {source}: give a run folder, a saved folder, a Hub id 'owner/name', or one of those "
-        f"that come with derender ({', '.join(bundled_models())})"
-    )
+    own = f"one of those that come with derender ({', '.join(bundled_models())})"
+    fix = f"give a run folder, a saved folder, a Hub id 'owner/name', or {own}"
+    raise FileNotFoundError(f"no model at {source}: {fix}")
 
 
 def downloaded(repository: str, names: Sequence[str]) -> Path:
@@ -92,10 +88,9 @@ def downloaded(repository: str, names: Sequence[str]) -> Path:
     try:
         return Path(snapshot_download(repository, allow_patterns=list(names)))
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        raise FileNotFoundError(
-            f"no folder {repository} here, and the Hub gave nothing under that id ({type(error).__name__}): "
-            "check the path or the id, and the network"
-        ) from error
+        why = f"the Hub gave nothing under that id ({type(error).__name__})"
+        fix = "check the path or the id, and the network"
+        raise FileNotFoundError(f"no folder {repository} here, and {why}: {fix}") from error
 
 
 def hub_id(name: str) -> bool:

@@ -76,10 +76,9 @@ class Shareable:
         beside = texts_beside(self.source, self.tensors())
         own = CARD_FILE in beside and not (data or licence or scores)  # part of one would drop the licence
         if not (card or (data and licence) or own):
-            raise ValueError(
-                "a card needs both: state what it was trained on and what it may be used for, "
-                "push_to_hub(..., data=..., licence=...), or pass card="
-            )
+            how = "push_to_hub(..., data=..., licence=...), or pass card="
+            what = "state what it was trained on and what it may be used for"
+            raise ValueError(f"a card needs both: {what}, {how}")
         card = card or self._card(beside, repository, data, licence, scores)
         with TemporaryDirectory() as place:
             folder = self.save_pretrained(Path(place) / "model", card=card, licence=licence)
@@ -90,15 +89,13 @@ class Shareable:
             except HFValidationError as error:
                 raise ValueError(f"{repository!r} is no name on the Hub: give OWNER/NAME") from error
             except (HfHubHTTPError, LocalTokenNotFoundError) as error:
-                raise PermissionError(
-                    f"the Hub refuses {repository} ({' '.join(str(error).split())}): log in with "
-                    "'hf auth login' or pass token=, with the right to write there"
-                ) from error
+                why = " ".join(str(error).split())
+                fix = "log in with 'hf auth login' or pass token=, with the right to write there"
+                raise PermissionError(f"the Hub refuses {repository} ({why}): {fix}") from error
             except Exception as error:  # the client's HTTP library decides what a broken connection raises
-                raise ConnectionError(
-                    f"the Hub cannot be reached ({type(error).__name__}: {error}); nothing is lost: "
-                    "model.save_pretrained writes the same files to a folder"
-                ) from error
+                what = f"the Hub cannot be reached ({type(error).__name__}: {error})"
+                fix = "nothing is lost: model.save_pretrained writes the same files to a folder"
+                raise ConnectionError(f"{what}; {fix}") from error
         return str(made)
 
     def _card(self, beside: Mapping[str, str], title: str, *stated: str | None) -> str:
@@ -133,10 +130,8 @@ def _errors_in_words(errors: str) -> str:
     except ValueError:
         return ""
     median, high = stored.quantiles[50], stored.quantiles[99]
-    return (
-        f"Masked L1 of reconstructions of {stored.pictures:,} held-out images: median {median:.4f}, "
-        f"99th percentile {high:.4f} (0..1, best 0)."
-    )
+    values = f"median {median:.4f}, 99th percentile {high:.4f} (0..1, best 0)"
+    return f"Masked L1 of reconstructions of {stored.pictures:,} held-out images: {values}."
 
 
 KINDS = ("bytes", "float16")  # of the large maps of whitening and fitting; weights are float16 in both
@@ -169,10 +164,9 @@ def pack_model(
                 elif weight or _LARGE.fullmatch(name):
                     small[name] = value.half()
                     if not bool(small[name].isfinite().all()):
-                        raise ValueError(
-                            f"{name} has numbers that half precision cannot hold (beyond 65,504, or NaN), "
-                            "so this model cannot be packed: its training went wrong, train it again"
-                        )
+                        what = f"{name} has numbers that half precision cannot hold (beyond 65,504, or NaN)"
+                        fix = "its training went wrong, train it again"
+                        raise ValueError(f"{what}, so this model cannot be packed: {fix}")
             write_tensors(small, temporary / file, metadata)
             sizes["before"] += (own / file).stat().st_size
             sizes["after"] += (temporary / file).stat().st_size

@@ -124,7 +124,5 @@ def check_pickle(file: Path) -> None:
     except (ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} is no file of weights ({error}): not opened") from error
     if not reads_safely():
-        raise ValueError(
-            f"{file} is a pickle, and PyTorch {torch.__version__} can be made to run code by a crafted one "
-            f"(CVE-2026-24747): install PyTorch {SAFE_SINCE} or newer"
-        )
+        why = f"PyTorch {torch.__version__} can be made to run code by a crafted one (CVE-2026-24747)"
+        raise ValueError(f"{file} is a pickle, and {why}: install PyTorch {SAFE_SINCE} or newer")
