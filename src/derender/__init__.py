@@ -5,6 +5,7 @@ Everything public is reached from here and imported on first use, so that
 """
 
 import importlib
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ _NAMES = {
     "evaluation": ("compare",),
     "interpretation": ("explain",),
 }
-_HOME = {name: f"derender.{module}" for module, names in _NAMES.items() for name in names}
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
 _SUBMODULES = [
     *("scene", "render", "data", "networks", "objectives", "model", "training", "photo", "features"),
     *("baselines", "evaluate", "evaluation", "interpretation", "report"),
@@ -43,12 +44,17 @@ __all__ = [
 ]  # fmt: skip
 
 
+def on_first_use(package: str, homes: Mapping[str, str], name: str) -> Any:
+    """A name of a package, from its module among ``homes``: what a package's ``__getattr__`` gives."""
+    if name not in homes:
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+
+
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(_HOME[name]), name)
     if name in _SUBMODULES:
         return importlib.import_module(f"derender.{'evaluation' if name == 'evaluate' else name}")
-    raise AttributeError(f"module 'derender' has no attribute {name!r}")
+    return on_first_use(__name__, _HOME, name)
 
 
 def __dir__() -> list[str]:

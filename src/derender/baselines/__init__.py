@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from derender import on_first_use
+
 if TYPE_CHECKING:
     from derender.features import Embedded
 
@@ -35,9 +37,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'derender.baselines' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"derender.baselines.{_HOME[name]}"), name)
+    return on_first_use(__name__, _HOME, name)
 
 
 def network_type(name: str, among: Sequence[str] = TRAINED) -> Any:

@@ -24,8 +24,7 @@ from derender.storage.places import optional
 from derender.training.task import TrainResult
 
 Classes = dict[str, tuple[str, ...]]  # class names of every label column
-MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)
-"""Views of labelled images: a little crop, flip and jitter."""
+MILD = AugmentSettings(crop_from=0.7, jitter=0.5, hue_deg=0.0, grey=0.0, blur=0.0)  # of labelled images
 
 
 class Resnet18Settings(BaselineSettings):

@@ -4,9 +4,10 @@ table: the value; parquet: its file; extract: model and images to features; tran
 embedding: images to a table in memory or a file (blocks: on the way there); neighbours: nearest rows.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
+from derender import on_first_use
 from derender.features.extract import (
     Progress,
     embed_image_set,
@@ -31,9 +32,5 @@ __all__ = [
 
 _HOME: dict[str, str] = dict.fromkeys(("Embedded", "embed", "embed_to_file", "unlike_training"), "embedding")
 _HOME |= {"search": "neighbours", "DisentangledFeatures": "transformer"}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:  # scikit-learn and pyarrow are slow to import, and decomposing an image needs neither
-        return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# scikit-learn and pyarrow are slow to import, and decomposing an image needs neither
+__getattr__ = partial(on_first_use, __name__, _HOME)

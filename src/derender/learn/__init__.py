@@ -4,8 +4,10 @@ Each is imported on first use. It takes images or the address of a data set, and
 folder of a model. Of several processes that torchrun starts, the first reads the images and writes.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
+
+from derender import on_first_use
 
 if TYPE_CHECKING:
     from derender.learn.copies import ModelCopy, copy_settings, refine, unet, whiten
@@ -17,10 +19,6 @@ __all__ = [
     "run_settings", "train", "unet", "whiten",
 ]  # fmt: skip
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module 'derender.learn' has no attribute {name!r}")
-    homes = {"copies": ("ModelCopy", "copy_settings", "refine", "unet", "whiten"), "sweep": ("compare_plan",)}
-    module = next((home for home, names in homes.items() if name in names), "runs")
-    return getattr(importlib.import_module(f"derender.learn.{module}"), name)
+_COPIES = ("ModelCopy", "copy_settings", "refine", "unet", "whiten")
+_HOME = {**dict.fromkeys(__all__, "runs"), **dict.fromkeys(_COPIES, "copies"), "compare_plan": "sweep"}
+__getattr__ = partial(on_first_use, __name__, _HOME)

@@ -27,8 +27,7 @@ from derender.storage.tensors import read_tensors
 LARGEST_SIDE = 1024  # larger photographs are searched at this size
 SMALLEST_FACE = 20
 CONFIDENT = 0.95
-CUT_SIZE, CUTS = 192, (1.3, 1.15, 1.5)
-"""Side in pixels at which candidates are cut out and searched for again, and of the cuts over UTKFace's."""
+CUT_SIZE, CUTS = 192, (1.3, 1.15, 1.5)  # side in pixels of cuts that are searched again, and over UTKFace's
 PROFILE_DEG = 60.0  # faces that are turned farther are profiles, which the bundled models do not know
 YAW_CROP, YAW_CROP_SIDE = 48, 1.4  # side of the network's crop in pixels, and in sides of the detector's box
 YAW_SCALE_DEG = 60.0

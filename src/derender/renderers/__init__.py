@@ -25,8 +25,7 @@ __all__ = [
     "RENDERERS", "Render", "Renderer", "as_renderer", "brings_code", "recorded_renderer", "renderer_named",
 ]  # fmt: skip
 
-Render = Callable[[Scene, float], Rendering]
-"""Anything that draws scenes with a horizontal field of view in degrees, such as a ``Renderer``."""
+Render = Callable[[Scene, float], Rendering]  # of scenes and a horizontal field of view in degrees
 
 RENDERERS: dict[str, Callable[..., Renderer]] = {
     name: getattr(importlib.import_module(f"{__name__}.{file}"), file)

@@ -40,8 +40,7 @@ FILM = "film.mp4"
 ROWS = ".sheet"  # folder of the rows of a sheet, a file for each image, until the sheet is drawn
 NAMED = 5  # so many images that cannot be read are named
 
-Edited: TypeAlias = "Decomposition | Edit | Mesh"
-"""What can be written for one image: ``write`` its files, and a ``row`` of the sheet over all images."""
+Edited: TypeAlias = "Decomposition | Edit | Mesh"  # has files to ``write``, and a ``row`` of the sheet
 
 
 @dataclass(frozen=True)

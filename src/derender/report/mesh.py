@@ -141,7 +141,12 @@ def mesh_of(scene: Scene, fov_deg: float, border_columns: int = 0, grazing_deg: 
     points = unproject(depth, fov_deg)[0]
     inside = torch.ones(height - 1, width - 1, dtype=torch.bool)
     inside[:, :border_columns] = inside[:, width - 1 - border_columns :] = False
-    surface = _largest_piece((inside & _facing(points, grazing_deg)).numpy())
+    cells = (inside & _facing(points, grazing_deg)).numpy()
+    pieces = np.zeros(cells.shape, np.int32)
+    ndimage.label(cells, output=pieces)
+    if pieces.max() > 1:  # the largest, connected by sides, is the surface, with the holes in it filled
+        cells = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+    surface = np.asarray(ndimage.binary_fill_holes(cells))
     if not surface.any():
         fix = "allow more, or see whether the model was trained"
         raise ValueError(f"nothing of this surface is seen at less than {grazing_deg:g} degrees: {fix}")
@@ -175,12 +180,3 @@ def _facing(points: Float[Tensor, "h w 3"], grazing_deg: float) -> Tensor:
         cosine = (normal * corner).sum(dim=-1) / (normal.norm(dim=-1) * corner.norm(dim=-1))
         facing &= cosine > cos(radians(grazing_deg))
     return facing
-
-
-def _largest_piece(cells: np.ndarray) -> np.ndarray:
-    """The largest set of cells connected by their sides, with the holes in it filled."""
-    pieces = np.zeros(cells.shape, np.int32)
-    ndimage.label(cells, output=pieces)
-    if pieces.max() > 1:
-        cells = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
-    return np.asarray(ndimage.binary_fill_holes(cells))

@@ -15,8 +15,7 @@ from derender.scene.light import light_direction
 
 MEAN = math.sqrt(1 / (4 * math.pi))  # Y_0: the mean irradiance is this times the first coefficient
 LINEAR = math.sqrt(3 / (4 * math.pi))
-LIMITS = (2 / math.sqrt(3), math.sqrt(5) / 4)
-"""The largest norms of orders 1 and 2 over that of order 0, met by a single directional light."""
+LIMITS = (2 / math.sqrt(3), math.sqrt(5) / 4)  # norms of orders 1, 2 over order 0's, of one directional light
 _LEAST_FORWARD = 0.05  # share of the main light that goes forwards: a scene's light is before its object
 
 

@@ -29,8 +29,7 @@ class PerturbSettings(Settings):
     camera_yaw_deg: float = Field(default=45.0, ge=0)  # rotation about y
 
 
-MANY_ORDERS = 64
-"""Random orders drawn at once. A third of all leaves nothing in its place: none does once in 10^12 draws."""
+MANY_ORDERS = 64  # drawn at once; a third of all leaves nothing in its place: none does once in 10^12 draws
 DEFAULT_CHANGES = PerturbSettings()
 DEFAULT_RANGES = SceneRanges()
 

@@ -28,8 +28,7 @@ USUAL_BATCH = 16
 GRACE_IMAGES = 4_000  # a network that has just started has no geometry yet
 PERSISTENCE_IMAGES = 4_000  # how long a sign must stay on
 MEMORY_IMAGES = 2_000  # over how many images measurements are averaged
-INVERTED = {"depth": (0,), "light": (2, 3), "camera": (0, 1)}
-"""By parameter of the scene the outputs that change sign where a relief is pressed in instead of out."""
+INVERTED = {"depth": (0,), "light": (2, 3), "camera": (0, 1)}  # outputs whose sign an inverted relief changes
 INVERSION = ("", "due", "done")
 SLOWER = "use a smaller learning_rate (1e-4 or less), a weight_decay of 5e-4 and warmup_images"
 

@@ -36,8 +36,7 @@ LONG_WORK = 6  # opening, which fits, and films may take so many times as long a
 
 REQUEST_LIMIT_BYTES = 10_000
 
-DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES
-"""So much of a body that is too large is still read and dropped, so that browsers see the answer."""
+DRAINED_AT_MOST_BYTES = 3 * BODY_LIMIT_BYTES  # of a body that is too large, so that browsers see the answer
 
 FILE_TYPES = {b"glTF": "model/gltf-binary", b"PK": "application/zip", b"{": "application/json"}
 MEDIA_TYPES = IMAGE_TYPES | FILE_TYPES
