@@ -30,10 +30,9 @@ def refine(images: PartOfImages, model: TrainedModel, out: OutModel, output: Out
     """
     scores = how.make(learn.refine, "refining", images, model, out, output)
     errors = scores["errors"]
-    notice(
-        f"{scores['held_out']} held-out images: reconstructed with an error of {errors['now']:.4f}, before "
-        f"{errors['before']:.4f}, fitted {errors['fitted']:.4f}"
-    )
+    now = f"reconstructed with an error of {errors['now']:.4f}"
+    others = f"before {errors['before']:.4f}, fitted {errors['fitted']:.4f}"
+    notice(f"{scores['held_out']} held-out images: {now}, {others}")
     for name, gap in scores["gaps"].items():
         notice(f"{name}: {gap['now']:.2f} mean deviations from fitted scenes, before {gap['before']:.2f}")
 
@@ -47,8 +46,6 @@ def unet(images: PartOfImages, model: TrainedModel, out: OutModel, output: Outpu
     """
     scores = how.make(learn.unet, "distilling", images, model, out, output)
     errors = scores["errors"]
-    notice(
-        f"mean errors against {model.model}: place {errors['place']:.2f} pixels, depth {errors['depth']:.1%} "
-        f"of its range, albedo {errors['albedo']:.3f}; reconstruction {errors['reconstruction']:.4f}, before "
-        f"{errors['reconstruction before']:.4f}"
-    )
+    shares = f"depth {errors['depth']:.1%} of its range, albedo {errors['albedo']:.3f}"
+    again = f"reconstruction {errors['reconstruction']:.4f}, before {errors['reconstruction before']:.4f}"
+    notice(f"mean errors against {model.model}: place {errors['place']:.2f} pixels, {shares}; {again}")

@@ -36,9 +36,8 @@ def import_checkpoint(
         overwrite=output.force,
     )  # fmt: skip
     counts = {name: sum(value.numel() for value in model.nets[name].parameters()) for name in NETS.values()}
-    notice(
-        f"{model.image_size} x {model.image_size} pixels, {sum(counts.values()):,} parameters; measure how "
-        f"well it reconstructs your images: derender evaluate reconstruction IMAGES --model {folder}"
-    )
+    how = f"derender evaluate reconstruction IMAGES --model {folder}"
+    size = f"{model.image_size} x {model.image_size} pixels, {sum(counts.values()):,} parameters"
+    notice(f"{size}; measure how well it reconstructs your images: {how}")
     output.result(f"model {folder}")
     output.write({"model": folder, "numbers": counts, "image_size": model.image_size})

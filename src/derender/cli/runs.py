@@ -64,7 +64,6 @@ def report_run(run: "TrainResult") -> None:
     took = f"{console.duration(run.seconds)}, {run.waiting:.1%} of it waiting for data"
     console.notice(f"{run.images:,} images in {took}; stopped by: {run.stopped}")
     if run.stopped != "collapse" and run.model_images not in (None, run.images):
-        console.notice(
-            f"the model has the weights of {run.model_images:,} images, the best on held-out ones; "
-            "for those of the end: the same command with --resume --set keep=last"
-        )
+        weights = f"the model has the weights of {run.model_images:,} images, the best on held-out ones"
+        last = "for those of the end: the same command with --resume --set keep=last"
+        console.notice(f"{weights}; {last}")

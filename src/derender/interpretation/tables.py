@@ -188,11 +188,10 @@ def share_table(result: Explanation) -> ScoreTable:
         return [*shown, *_means(row.auc[..., None], answer)]
 
     what = "yes/no labels" if result.kind == "labels" else "classes, each on its own images"
-    caption = (
-        f"Share of each factor in the answer: {result.head} probe of {result.n_train:,} images, "
-        f"{result.n_test:,} held out, {counted(len(model.shares), 'seeds')}, {len(result.names)} {what}; "
-        f"{result.output} from a {result.baseline} baseline, completeness error {model.error:.1e}"
-    )
+    seeds = f"{result.n_test:,} held out, {counted(len(model.shares), 'seeds')}, {len(result.names)} {what}"
+    how = f"{result.output} from a {result.baseline} baseline, completeness error {model.error:.1e}"
+    probe = f"{result.head} probe of {result.n_train:,} images, {seeds}"
+    caption = f"Share of each factor in the answer: {probe}; {how}"
     return _answers(result, caption, [*columns, AUC], cells)
 
 

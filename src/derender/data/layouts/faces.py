@@ -261,11 +261,10 @@ def _face_boxes(source: Source, names: Sequence[str]) -> Float32[np.ndarray, "n 
     if own is not None:
         return _own_boxes(source, own, names)
     if landmarks is None:
-        raise ValueError(
-            f"{source.path} holds CelebA's images in the wild (img_celeba), but no list_landmarks_celeba.txt,"
-            f" which says where faces are. The owners publish it at {layout.TOLD['celeba']['home']}. "
-            f"A list of your own may stand in for it: {BOX_LIST}, with rows of file,{','.join(_SIZED)}"
-        )
+        what = "CelebA's images in the wild (img_celeba), but no list_landmarks_celeba.txt"
+        why = f"which says where faces are. The owners publish it at {layout.TOLD['celeba']['home']}"
+        fix = f"A list of your own may stand in for it: {BOX_LIST}, with rows of file,{','.join(_SIZED)}"
+        raise ValueError(f"{source.path} holds {what}, {why}. {fix}")
     points = landmarks.numbers(_POINTS, names).reshape(-1, 4, 2)
     eyes, mouth = points[:, :2].mean(axis=1), points[:, 2:].mean(axis=1)
     apart = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)

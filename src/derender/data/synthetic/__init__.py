@@ -45,8 +45,7 @@ class BenchmarkPart:
     truth: bool = False
 
 
-KINDS = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSettings)}
-"""By kind: the generator and its settings."""
+KINDS = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSettings)}  # and its settings
 
 PARTS = {
     kind: {name: BenchmarkPart(**row) for name, row in numbers_of(kind)["benchmark"].items()}

@@ -130,10 +130,8 @@ def _checked(arrays: dict[str, ndarray]) -> MorphableFaces:
     expressions = floats("expressions", -1, v, 3, default=none) * scale
     names = [str(name) for name in np.asarray(arrays.get("expression_names", ()))] if len(expressions) else []
     if len(names) != len(expressions) or not set(names) <= set(EXPRESSIONS):
-        raise ValueError(
-            f"expression_names must give one of {', '.join(EXPRESSIONS)} "
-            f"for each of {len(expressions)} expressions, got {names}"
-        )
+        needed = f"one of {', '.join(EXPRESSIONS)} for each of {len(expressions)} expressions"
+        raise ValueError(f"expression_names must give {needed}, got {names}")
     colours = floats("colours", v, 3, default=np.full((v, 3), np.nan), holes=True, unit=True)
     return MorphableFaces(
         mean=placed.astype(np.float32) - np.array([0, 0, 1], np.float32),
