@@ -15,7 +15,7 @@ BUDGET = {  # lines, files
     "data": (6_476, 30),
     "evaluation": (6_894, 32),
     "report": (3_690, 21),
-    "cli": (2_083, 29),
+    "cli": (2_087, 29),
     "training": (3_443, 19),
     "baselines": (2_307, 11),
     "render": (1_658, 15),
@@ -29,10 +29,10 @@ BUDGET = {  # lines, files
     "scene": (848, 11),
     "demo": (458, 3),
     "renderers": (628, 8),
-    "learn": (895, 5),
+    "learn": (896, 5),
 }
-TOTAL = (36_988, 234)
-TEST_LINES = 25_871
+TOTAL = (36_993, 234)
+TEST_LINES = 25_876
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

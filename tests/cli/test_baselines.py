@@ -122,4 +122,6 @@ def test_bad_words_are_one_line(run, faces, tmp_path, refused):
     assert "'model.codes'" in refused(*train, "--model", "vqvae", "--set", "codess=3")
     other = refused("train", "--model", "ae", "--data", faces, "--out", run, "--resume")
     assert f"{run} trained vqvae, not ae" in other
+    other = refused("train", "--data", faces, "--out", run, "--resume", *SETTINGS, *settings("seed=9"))
+    assert f"{run} was trained with another seed" in other
     assert not out.exists() and not (tmp_path / "run").exists()

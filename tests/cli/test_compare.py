@@ -43,7 +43,7 @@ def tables(tmp_path_factory) -> dict[str, Path]:
     """Feature tables with yes/no attributes and identities, one that knows them and two that do not."""
     folder, rng = tmp_path_factory.mktemp("tables"), np.random.default_rng(0)
     who = np.arange(ROWS * 3) % 4
-    labels = {"identity": np.array(list("abcd"))[who], "smiles": (who % 2).astype(np.int8)}
+    labels = {"identity": np.array(list("abef"))[who], "smiles": (who % 2).astype(np.int8)}
     labels |= {"young": (who // 2).astype(np.int8)}
     files = tuple(f"{row}.png" for row in range(len(who)))
 
@@ -78,6 +78,9 @@ def test_a_clustering_table_beside_the_papers(tables, tmp_path, capsys, numbers)
     assert main([*map(str, words), *QUICK, str(tmp_path / "cache")]) == 0
     shown = capsys.readouterr()
     assert "0 results computed, 6 found" in shown.err and "paper: Ours - LOOCC-L " in shown.out
+    half = numbers(*words, *QUICK, tmp_path / "cache", "--half", "test", "--force", "--markdown", text)[0]
+    assert half["half"] == "test" and "test half" in text.read_text()
+    assert half["parts"]["identity"]["n_rows"] == 40  # of two of the four people
 
 
 def test_a_model_is_embedded_once_beside_its_untrained_twins(model, people, tmp_path, capsys, numbers):

@@ -1,6 +1,7 @@
 """`derender compare`: one of the paper's tables for other features, or by plan many methods trained here."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from derender.cli import options, scoring
 from derender.cli.options import command, option
@@ -50,13 +51,16 @@ def compare(
         raise ValueError("--out and --dry-run go with --plan FILE")
     if paper.table is None:
         raise ValueError("give --table NAME with --model or --features, or --plan FILE with --out DIR")
+    from derender.data import half_of
     from derender.features import FeatureTable
 
     tables = scoring.named_paths(paper.features or (), "--features")
     models = scoring.named_paths(paper.model or (), "--model")
-    read = {name: list(map(FeatureTable.read, paths)) for name, paths in tables.items()}
+    halved = partial(half_of, half=images.half)
+    read = {name: [halved(FeatureTable.read(path)) for path in paths] for name, paths in tables.items()}
     own = {name: value for name, value in vars(paper).items() if name not in ("table", "features", "model")}
     own |= {"factors": scoring.names_of(paper.factors)}
     own |= {"counts": scoring.numbers_of(paper.counts, "--counts")}
     given = (paper.table, {**read, **models}, images.optional_address)
-    published.publish(scoring.measured("compare", *given, **images.how, **vars(computed), **own))
+    scores = scoring.measured("compare", *given, **images.how, **vars(computed), **own)
+    published.publish(scores, half=images.half)

@@ -57,6 +57,7 @@ def run_settings(
     model, own = model or "derender", None
     if resume and out is not None and (Path(out) / "config.yaml").is_file():
         own = stored_config(Path(out), model)
+        model = getattr(own, "baseline", model)
         if not changes and (preset, loocc, start_from, renderer) == (None, None, None, None):
             return own
     if model == "derender":

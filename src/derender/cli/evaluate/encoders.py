@@ -41,7 +41,7 @@ def segment(
         from derender.report.protocols import write_overlays
 
         published.result(f"overlays {write_overlays(scores.result, out)}")
-    published.publish(scores, model=trained.model)
+    published.publish(scores, model=trained.model, half=images.half)
 
 
 @dataclass(frozen=True)
@@ -74,4 +74,4 @@ def disentangle(
 
         write_card(scores.result, f"{trained.model}: {len(chosen):,} images", out)
         published.result(f"matrices in {out}")
-    published.publish(scores)
+    published.publish(scores, half=images.half)

@@ -52,7 +52,7 @@ def robustness(
         axes=scoring.names_of(axes) or (), angles=scoring.numbers_of(angles, "--angles"),
         factors=scoring.names_of(factors),
     )  # fmt: skip
-    published.publish(scores, models=model)
+    published.publish(scores, models=model, half=images.half)
     if out is not None:
         from derender.report.protocols import write_curves
 

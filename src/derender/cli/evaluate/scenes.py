@@ -66,7 +66,7 @@ def reconstruction(
         "reconstruction", loaded, chosen, training_images=learned, **model.how, batch_size=batch_size,
         cache=cache, doing="rendering",
     )  # fmt: skip
-    published.publish(scores, part=images.part)
+    published.publish(scores, part=images.part, half=images.half)
     if store:
         file = write_errors(model_folder(model.model), errors_of(loaded, chosen.images, batch_size))
         notice(f"errors of {len(chosen):,} images stored in {file}")
