@@ -43,6 +43,11 @@ def scene_for(name: str, generator, count: int = 2, side: int = 16, dtype=torch.
 @pytest.mark.parametrize("name", ALL)
 def test_gradients_of_every_parameter_are_those_of_finite_differences(name, generator):
     given, renderer = scene_for(name, generator, 1, 5), renderer_named(name)
+    if "shadow" in name:  # of a ridge, with umbra and penumbra
+        given.depth[:, :, 2] = 1 - torch.linspace(0.03, 0.04, 5)
+        given.light[:, 2:] = torch.tensor([0.1, -1.05])
+        share = visible(given.depth, given.light, FOV_DEG)
+        assert ((share > 0.05) & (share < 0.95)).sum() > 1 and (share == 0).any()
     names, values = zip(*given.parameters.items(), strict=True)
 
     def image(*changed: Tensor) -> Tensor:
