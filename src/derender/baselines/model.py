@@ -33,7 +33,7 @@ from derender.training.loop import train_task
 
 PICKLES = (".pth", ".pt", ".ckpt", ".pkl", ".pickle", ".bin")
 OUTSIDE_LOSS = ("l1", "codes_used", "active", "found")  # numbers that ``losses`` returns beside the losses
-Images = Float[Tensor, "n 3 h w"]  # images, in 0..1 where nothing else is said
+Images = Float[Tensor, "n 3 h w"]  # in 0..1 unless stated
 Features = dict[str, Float[Tensor, "n _"]]
 
 

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _command._main_shell_completion({}, "derender")  # answers and ends
     try:
         with damage_as_notices(), _command.make_context("derender", arguments) as context:
-            _command.invoke(context)  # typer's main hides what Ctrl-C said
+            _command.invoke(context)  # typer's main hides the message of Ctrl-C
         sys.stdout.flush()
         return 0
     except typer.Exit as end:
