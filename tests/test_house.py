@@ -13,25 +13,25 @@ from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 
 BUDGET = {  # lines, files
     "data": (6_476, 30),
-    "evaluation": (6_894, 32),
+    "evaluation": (6_897, 32),
     "report": (3_690, 21),
-    "cli": (2_087, 29),
+    "cli": (2_086, 29),
     "training": (3_443, 19),
-    "baselines": (2_307, 11),
+    "baselines": (2_308, 11),
     "render": (1_658, 15),
-    "features": (1_244, 8),
+    "features": (1_246, 8),
     "interpretation": (1_018, 5),
-    "photo": (1_551, 7),
+    "photo": (1_555, 7),
     "networks": (668, 5),
     "storage": (884, 7),
     "objectives": (604, 5),
     "postprocess": (951, 5),
-    "scene": (848, 11),
+    "scene": (847, 11),
     "demo": (458, 3),
-    "renderers": (628, 8),
+    "renderers": (627, 8),
     "learn": (896, 5),
 }
-TOTAL = (36_993, 234)
+TOTAL = (37_000, 234)
 TEST_LINES = 25_881
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

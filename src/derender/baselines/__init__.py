@@ -119,4 +119,5 @@ def embed_baseline(
     origin |= {} if part == "all" else {"part": part}
     replace(table, origin=origin).write(out)
     counts = len(images.skipped), images.skipped[:LISTED_SKIPPED], len(images.duplicates), 0
-    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, *counts, kept)
+    of = origin["data"], origin["layout"]
+    return Embedded(Path(out), len(table), widths, tuple(table.labels), origin, *counts, *of, kept)

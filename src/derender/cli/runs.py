@@ -65,5 +65,4 @@ def report_run(run: "TrainResult") -> None:
     console.notice(f"{run.images:,} images in {took}; stopped by: {run.stopped}")
     if run.stopped != "collapse" and run.model_images not in (None, run.images):
         weights = f"the model has the weights of {run.model_images:,} images, the best on held-out ones"
-        last = "for those of the end: the same command with --resume --set keep=last"
-        console.notice(f"{weights}; {last}")
+        console.notice(f"{weights}; for those of the end: the same command with --resume --set keep=last")

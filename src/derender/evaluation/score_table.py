@@ -87,6 +87,10 @@ class ScoreTable:
         """Every finite number of one column."""
         return [number for row in self.rows if (number := _number(row.cells[column])) is not None]
 
+    def largest(self, column: int) -> float:
+        """The largest absolute number of a column, 0 without any."""
+        return max(map(abs, self.numbers(column)), default=0.0)
+
     def best(self, column: int) -> float | None:
         """The best number of a column; None where the column is no score or there is nothing to compare."""
         numbers, end = self.numbers(column), self.columns[column].best

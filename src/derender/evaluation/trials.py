@@ -71,8 +71,7 @@ class Axis:
         """(N,) angles off the front by the labels, in degrees, 0 or more; without these labels an error."""
         if absent := [name for name in self.truth if name not in labels]:
             what = f"the true {self.title} is not among the labels (there is no {absent[0]!r})"
-            fix = "give rendered images with a params.csv, as derender synth writes them"
-            raise ValueError(f"{what}: {fix}")
+            raise ValueError(f"{what}: give rendered images with a params.csv, as derender synth writes them")
         angles = [np.asarray(labels[name], np.float64) for name in self.truth]
         if len(angles) == 1:
             return np.degrees(np.abs(angles[0]))

@@ -55,15 +55,16 @@ class Embedded:
     examples: tuple[Skipped, ...]
     copies: int
     resumed: int
+    source: str
+    layout: str
     kept: bool = False
 
     def describe(self) -> str:
         """One line: how many images of which data set, how many were left out or had been there."""
         copies = f"identical copies {'kept' if self.kept else 'dropped'}"
         counts = {"of them from the run before": self.resumed, "skipped": self.skipped, copies: self.copies}
-        source, layout = self.origin["data"], self.origin["layout"]
         further = [f"{count:,} {text}" for text, count in counts.items() if count]
-        return ", ".join([f"{counted(self.rows, 'images')} from {source} ({layout})", *further])
+        return ", ".join([f"{counted(self.rows, 'images')} from {self.source} ({self.layout})", *further])
 
 
 def embed(
@@ -234,4 +235,5 @@ def _finish(parts: Parts, path: Path, images: Source, facts: Facts, resumed: int
     shutil.rmtree(parts.folder, ignore_errors=True)
     widths = {name: values.shape[1] for name, values in first.factors.items()}
     counts = (len(skipped), skipped[:LISTED_SKIPPED], parts.copies, resumed)
-    return Embedded(path, parts.rows, widths, tuple(first.labels), facts, *counts, kept)
+    of = images.source, images.layout
+    return Embedded(path, parts.rows, widths, tuple(first.labels), facts, *counts, *of, kept)

@@ -238,8 +238,7 @@ class PhotoDetail:
             image = interpolate(image, (side, side), mode="bilinear", antialias=True)
         edge = spread * (1 - 1 / self.model_size) / self.span
         centres = _square(torch.linspace(-edge, edge, size)).to(image)
-        result = sampled(image, centres, mode="bicubic", padding_mode="border")
-        return result.clamp(0, 1)
+        return sampled(image, centres, mode="bicubic", padding_mode="border").clamp(0, 1)
 
     def _completed(self, own: Scene) -> Float[Tensor, "1 3 g g"]:
         """The model's albedo in the photograph's colours, as far as those reach."""

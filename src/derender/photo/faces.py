@@ -64,6 +64,11 @@ class Face:
     rejected: str = ""
     yaw_deg: float = 0.0
 
+    @property
+    def width(self) -> float:
+        """Of the box, in pixels."""
+        return self.box[2] - self.box[0]
+
 
 def find_faces(photo: Pixels) -> list[Face]:
     """The faces of a photograph, the largest first; none where there are none."""
@@ -89,7 +94,7 @@ def face_candidates(photo: Pixels) -> list[Face]:
         candidates += checked
         if any(not face.rejected for face in checked):
             break
-    return sorted(_distinct(candidates), key=lambda face: face.box[0] - face.box[2])
+    return sorted(_distinct(candidates), key=lambda face: -face.width)
 
 
 def _both_ways(photo: Pixels) -> tuple[list[Face], list[Face]]:

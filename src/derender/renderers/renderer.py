@@ -58,8 +58,7 @@ class Renderer:
     @property
     def all_factors(self) -> tuple[Factor, ...]:
         """The paper's four rows, changed and extended by this renderer's."""
-        rows = {row.name: row for row in (*FACTORS, *self.factors)}
-        return tuple(rows.values())
+        return tuple({row.name: row for row in (*FACTORS, *self.factors)}.values())
 
     def __call__(self, scene: Scene, fov_deg: float, backend: str = "auto") -> Rendering:
         """Images of scenes; a number out of its range, or NaN made of finite scenes, is a ValueError."""

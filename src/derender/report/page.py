@@ -81,7 +81,7 @@ def html_cells(scores: ScoreTable, row: Any) -> list[tuple[str, dict[str, str]]]
             attributes["data-value"] = f"{float(cell):.9g}"
             if cell == scores.best(place):
                 attributes["class"] = "best"
-            if column.best and (largest := max(map(abs, scores.numbers(place)), default=0)) > 0:
+            if column.best and (largest := scores.largest(place)) > 0:
                 attributes["style"] = f"--share:{abs(cell) / largest:.3f}"
         cells.append((text, attributes))
     return cells

@@ -84,8 +84,7 @@ def to_canonical(
     """Camera frame to canonical frame, the inverse of ``to_camera``."""
     rotation, centre = rotation_matrix(camera[:, :3]), constant(OBJECT_CENTRE, points)
     offset = centre - ((centre + camera[:, 3:])[:, None] @ rotation)[:, 0]
-    moved = torch.baddbmm(offset[:, None], points.flatten(1, -2), rotation)
-    return moved.view(points.shape)
+    return torch.baddbmm(offset[:, None], points.flatten(1, -2), rotation).view(points.shape)
 
 
 def constant(values: Any, like: Tensor) -> Tensor:

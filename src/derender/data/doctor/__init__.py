@@ -29,7 +29,7 @@ AXIS_SYMMETRIC = 0.7  # both sides about an axis correlate by this much where it
 
 EXAMINED_PX = 64  # side at which images are read for an examination
 COMPARED = 4_000  # most distinct images that are compared with one another, evenly spaced
-FEWEST_COMPARED = 2 * measures.GROUPS  # with fewer distinct images nothing can be said about what they share
+FEWEST_COMPARED = 2 * measures.GROUPS  # fewer distinct images do not show what they share
 ODD_LIKENESS = 0.15  # an image less like the others than this is unlike all of them
 SHOWN = 8  # images in each row of examples, at most
 
