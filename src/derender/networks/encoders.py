@@ -102,7 +102,7 @@ class NormReLU(nn.GroupNorm):
         self.slope = slope
 
     def forward(self, input: Spatial) -> Spatial:
-        normalised = super().forward(input)
+        normalised = super().forward(input.to(self.weight.dtype)).to(input.dtype)  # slow in bfloat16
         return leaky_relu(normalised, self.slope) if self.slope else normalised.relu()
 
 
