@@ -21,9 +21,8 @@ def image_set() -> ImageSet:
 
 
 @pytest.fixture
-def model(tmp_path):
-    small = derender.Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4)
-    return small.save(tmp_path / "model")
+def model(tmp_path, smallest):
+    return smallest.save(tmp_path / "model")
 
 
 def test_values_pass_through(image_set, model):

@@ -67,11 +67,11 @@ def test_every_face_lies_where_the_model_has_it(aligned):
 
 
 def test_heads_of_either_family_keep_nearly_their_training_frame():
-    made = faces.generate(8, 256, seed=3, settings=FaceSettings(pictures_per_identity=1)).images
-    for images in (made.transpose(0, 2, 3, 1), [np.asarray(head(number, 256)) for number in range(8)]):
+    made = faces.generate(5, 256, seed=3, settings=FaceSettings(pictures_per_identity=1)).images
+    for images in (made.transpose(0, 2, 3, 1), [np.asarray(head(number, 256)) for number in range(5)]):
         template = TEMPLATES["rendered-faces-64"]
         results = [frame_of(face, template) for one in images for face in find_faces(one)]
-        assert len(results) >= 6 and abs(np.median([one.side for one in results]) / 256 - 1) < 0.08
+        assert len(results) >= 4 and abs(np.median([one.side for one in results]) / 256 - 1) < 0.08
 
 
 def test_the_transform_leads_back_into_the_photograph(aligned, photos):
@@ -98,6 +98,8 @@ def test_a_stopped_run_goes_on_and_a_finished_one_is_kept(photos, tmp_path, caps
 
     with pytest.raises(KeyboardInterrupt, match="the same command continues"):
         derender.align(photos, tmp_path / "a", progress=stop)
+    with pytest.raises(ValueError, match="not known to be of faces"):
+        derender.align(photos, tmp_path / "b", model="cars-64")
     with pytest.raises(ValueError, match="move it out"):
         derender.align(photos, photos / "crops")
     with pytest.raises(ValueError, match="other options"):
@@ -190,17 +192,12 @@ def test_a_table_of_a_stranger_is_refused_in_one_line(two_faces, tmp_path, table
         assert "boxes.csv.partial is no table of derender align (" in printed and len(printed) < 400
 
 
-def test_a_model_of_other_objects_is_refused(photos, tmp_path):
-    with pytest.raises(ValueError, match="not known to be of faces"):
-        derender.align(photos, tmp_path, model="cars-64")
-
-
 @pytest.mark.parametrize("yaw", [-70, -40, 0, 40, 70])
 def test_the_turn_of_a_head_is_told(yaw):
     """Of heads that are found, within 15 degrees."""
     view = {"yaw_deg": (yaw, yaw), "yaw_sd_deg": None}
     settings = FaceSettings.model_validate({"view": view, "pictures_per_identity": 1})
-    heads = (head.transpose(1, 2, 0) for head in faces.generate(5, 256, 5, settings).images)
+    heads = (head.transpose(1, 2, 0) for head in faces.generate(3, 256, 5, settings).images)
     places = [find_faces(np.pad(head, ((70, 70), (70, 70), (0, 0)), mode="edge")) for head in heads]
     turns = [face.yaw_deg for place in places for face in place]
     assert len(turns) >= 2 and np.abs(np.subtract(turns, yaw)).max() < 15

@@ -34,7 +34,8 @@ def outputs_of(name: str) -> dict[str, np.ndarray]:
     relit = scene.with_parameters(light=scene.light.flip(0), camera=scene.camera.flip(0))
     result = {f"code.{key}": value for key, value in model.encode(images).items()}
     # Coordinates of fitted scenes are left out: 60 steps magnify rounding.
-    result |= {f"feature.{key}": value[:, : ENCODED.get(name)] for key, value in model.embed(images).items()}
+    plain = model.with_features(model.features.with_steps(0))
+    result |= {f"feature.{key}": value[:, : ENCODED.get(name)] for key, value in plain.embed(images).items()}
     result |= {f"scene.{key}": _thinned(value) for key, value in scene.parameters.items()}
     for what, one in (("rendered", scene), ("moved", relit)):
         drawn = model.render(one)

@@ -1,7 +1,6 @@
 """The fast implementations against the definition, and as good citizens of torch, threads and processes."""
 
 import math
-import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -139,10 +138,26 @@ def test_operators_keep_torch_s_rules(backend, generator):
 
 
 @fast
-def test_compiles_without_graph_breaks(backend):
-    """In a process of its own: the type checks of the test run are Python that torch.compile cannot trace."""
+def test_compiles_without_graph_breaks_and_works_in_a_forked_process(backend):
+    """In a process of its own: the type checks of the test run are Python that torch.compile cannot trace.
+
+    There importing the renderer imports no compiler.
+    """
     code = f"""
-import torch
+import os, signal, sys, torch
+from derender.render.rasterize import rasterize
+assert not {{"numba", "triton"}} & {{*sys.modules}}
+from derender.scene.camera import focal_px, unproject
+if {backend!r} == "numba" and hasattr(os, "fork"):
+    torch.set_num_threads(2)
+    points = unproject(torch.ones(4, 5, 5), 10.0)
+    expected = rasterize(points, focal_px(5, 10.0), "numba").depth
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)
+        same = torch.equal(rasterize(points, focal_px(5, 10.0), "numba").depth, expected)
+        os._exit(0 if same else 1)
+    assert os.waitpid(child, 0)[1] == 0
 from derender.render import render
 def loss(*inputs):
     result = render(*inputs, 10.0, {backend!r})
@@ -185,27 +200,6 @@ def test_threads_change_nothing(generator):
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(result, expected) for result in results)
-
-
-@needs_numba
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-def test_importing_the_renderer_imports_no_compiler_and_it_works_in_a_forked_process():
-    code = """
-import os, signal, sys, torch
-from derender.render.rasterize import rasterize
-assert not {"numba", "triton"} & {*sys.modules}
-from derender.scene.camera import focal_px, unproject
-torch.set_num_threads(2)
-points = unproject(torch.ones(4, 5, 5), 10.0)
-expected = rasterize(points, focal_px(5, 10.0), "numba").depth
-child = os.fork()
-if child == 0:
-    signal.alarm(60)
-    same = torch.equal(rasterize(points, focal_px(5, 10.0), "numba").depth, expected)
-    os._exit(0 if same else 1)
-raise SystemExit(os.waitpid(child, 0)[1])
-"""
-    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
 
 
 @needs_numba

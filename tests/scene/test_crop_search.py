@@ -6,6 +6,7 @@ import torch
 from torch.nn.functional import interpolate
 
 import derender
+from derender.render import Rendering
 from derender.report.viewer.images import rendered_examples
 from derender.scene.crop import WHOLE, Crop, best_crop, candidate_crops, crop_errors
 
@@ -23,8 +24,8 @@ def model() -> derender.Derenderer:
 
 @pytest.fixture(scope="module")
 def faces_known() -> torch.Tensor:
-    """Three rendered faces that the model was tested on, (3, 3, 64, 64) in 0..1."""
-    examples = rendered_examples("rendered-faces-64", 64)[:3]
+    """Two rendered faces that the model was tested on, (2, 3, 64, 64) in 0..1."""
+    examples = rendered_examples("rendered-faces-64", 64)[:2]
     stacked = np.stack([example.picture for example in examples]).transpose(0, 3, 1, 2)
     return torch.from_numpy(stacked).float() / 255
 
@@ -33,7 +34,7 @@ def faces_known() -> torch.Tensor:
 def laid_in(faces_known) -> torch.Tensor:
     """The same, each smaller and off the middle of a larger image with something else around it."""
     size = 160
-    coarse = torch.rand(3, 3, 6, 6, generator=torch.Generator().manual_seed(0))
+    coarse = torch.rand(2, 3, 6, 6, generator=torch.Generator().manual_seed(0))
     canvas = interpolate(coarse, size=(size, size), mode="bicubic").clamp(0, 1)
     left, top, side = TRUE.corner(size)
     small = interpolate(faces_known, size=(side, side), mode="bilinear")
@@ -43,12 +44,12 @@ def laid_in(faces_known) -> torch.Tensor:
 
 def test_the_part_that_holds_what_the_model_knows_is_found(model, laid_in):
     results = [best_crop(model, one[None])[1] for one in laid_in]
-    assert len(results) == 3 and all(abs(one.side - 0.7) < 0.11 for one in results)
+    assert len(results) == 2 and all(abs(one.side - 0.7) < 0.11 for one in results)
     assert all(abs(one.across - 0.1) + abs(one.down - 0.2) < 0.21 for one in results)
 
 
 def test_what_the_model_knows_as_it_is_stays_whole(model, faces_known):
-    assert [best_crop(model, one[None])[1] for one in as_bytes(faces_known)].count(WHOLE) >= 2
+    assert [best_crop(model, one[None])[1] for one in as_bytes(faces_known)] == [WHOLE, WHOLE]
 
 
 def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
@@ -56,8 +57,8 @@ def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
     pictures = bytes_.float() / 255
     with torch.inference_mode():
         seen = model.reconstruct(pictures)
-    (result,) = crop_errors(model, bytes_, [WHOLE], batch_size=3)
-    for row in range(3):
+    (result,) = crop_errors(model, bytes_, [WHOLE], batch_size=2)
+    for row in range(2):
         inside = seen.mask[row] > 0
         target, drawn = pictures[row][:, inside].numpy(), seen.image[row][:, inside].numpy()
         variance = ((target - target.mean(axis=1, keepdims=True)) ** 2).sum()
@@ -67,11 +68,9 @@ def test_errors_are_shares_of_the_pictures_variance(model, faces_known):
 def test_a_plain_picture_and_one_with_nothing_in_it_have_an_answer(model, monkeypatch):
     plain = torch.full((2, 3, 128, 128), 90, dtype=torch.uint8)
     assert np.isfinite(crop_errors(model, plain, [WHOLE, TRUE])).all()
-    reconstruct = model.reconstruct
 
     def nothing(pictures):
-        seen = reconstruct(pictures)
-        return type(seen)(seen.image * 0, seen.depth, seen.mask * 0)
+        return Rendering(0 * pictures, *torch.zeros(2, *pictures[:, 0].shape))
 
     monkeypatch.setattr(model, "reconstruct", nothing)
     assert np.isinf(crop_errors(model, plain, [WHOLE, TRUE])).all()

@@ -22,7 +22,8 @@ def generated(kind: str, count: int = COUNT) -> np.ndarray:
     kinds = {"faces": {}, "one view": {"view": STILL}, "one light": {"light": FLAT}}
     kinds |= {"one view and light": {"view": STILL, "light": FLAT}, "from one side": {"view": SIDEWAYS}}
     settings = kinds[kind]
-    made = faces.generate(count, SIDE, 11, FaceSettings(pictures_per_identity=1, **settings))
+    each = 1 if kind == "faces" else 3  # images of a person
+    made = faces.generate(count, SIDE, 11, FaceSettings(pictures_per_identity=each, **settings))
     made.images.setflags(write=False)
     return made.images
 

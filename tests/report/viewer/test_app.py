@@ -28,15 +28,12 @@ LIGHT = {"ambient": 0.3, "diffuse": 0.7, "pitch_deg": 0.0, "yaw_deg": 0.0}
 FRONT = {"rotation_deg": [0, 0, 0], "translation": [0, 0, 0]}
 
 
-def test_about_says_what_there_is(client):
+def test_about_says_what_there_is_and_a_picture_is_taken_apart_and_shown(client):
     about = client.get("/api/about").json
     assert about["model"] == "<b>tiny</b>"
     assert not about["faces"] and not about["can_fit"]
     assert [example["name"] for example in about["examples"]] == ["<img src=x>"]
     assert about["table"] is None
-
-
-def test_a_picture_is_taken_apart_and_shown(client):
     result = client.opened(0)
     assert (result["width"], result["height"], result["framed"], result["faces"]) == (48, 40, "none", [])
     assert result["crop"] == {"x": 24, "y": 20, "side": 40, "roll_deg": 0}
