@@ -197,7 +197,9 @@ def test_the_last_good_state_is_kept_whatever_the_interval(tmp_path, monkeypatch
 
     monkeypatch.setattr(Watcher, "judge", ill)
     run = tmp_path / "run"
-    result = train(resolve("small", [*COLLAPSING, "learning_rate=1e-4", "width=4"]), generated(60), run)
+    result = train(
+        resolve("small", [*COLLAPSING, "learning_rate=1e-4", "width=4", "batch_size=32"]), generated(60), run
+    )
     assert (result.stopped, result.images) == ("collapse", 704)
     assert [row["images"] for row in read_metrics(run) if row["kind"] == "validation"] == [320]
     assert json.loads((run / "checkpoints/last/state.json").read_text())["state"]["images"] == 320
