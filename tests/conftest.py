@@ -68,6 +68,14 @@ def tiny(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _numba_for_few_pixels():
+    """Numba renders small images, too: it has to start once only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("derender.render.backends.FEW_PIXELS", 0)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _searched_once():
     """The detector of faces gives its answer again for pixels that it has searched before."""
     module = import_module("derender.photo.faces")

@@ -1,20 +1,11 @@
 """Images of noise that runs learn from."""
 
 import numpy as np
-import pytest
 import torch
 from safetensors.torch import load_file
 
 from derender.data import ImageSet
 from derender.training.checkpoint import WEIGHTS_FILE
-
-
-@pytest.fixture(scope="package", autouse=True)
-def _numba_for_few_pixels():
-    """Small images, too, are rendered by Numba: once it runs it is the faster."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("derender.render.backends.FEW_PIXELS", 0)
-        yield
 
 
 def noise_set(count: int, cells: int = 32) -> ImageSet:
