@@ -182,8 +182,8 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken = derender.load("rendered-faces-64")
     broken.nets["confidence"].requires_grad_(False)
     next(broken.nets["confidence"].parameters()).fill_(float("nan"))
-    with pytest.raises(ValueError, match="NaN or infinite after 32 images"):
-        distillation.refine(broken, images, images, changed(images=32, fit_steps=1))
+    with pytest.raises(ValueError, match="NaN or infinite after 8 images"):
+        distillation.refine(broken, images[:8], images[:1], changed(images=8, fit_steps=1))
 
 
 def test_only_clear_fits_are_distilled():
