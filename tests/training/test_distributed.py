@@ -20,6 +20,7 @@ from derender.training.batches import Batches
 from derender.training.distributed import Ranks
 from derender.training.run_folder import read_metrics
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # while threads run
 TINY = [
     *("image_size=32", "width=8", "light_width=4", "batch_size=8"),
     *("perceptual=self", "self_features_steps=2"),
@@ -40,13 +41,11 @@ def two_processes(commands: list[list[str]], place: Path) -> list[str]:
         "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "test",
         "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "GLOO_SOCKET_IFNAME": "lo", "GROUP_RANK": "0",
     }  # fmt: skip
-    port, children = free_port(), []
+    given = (commands, place / "found.json", free_port())
     for slow in ("torch._dynamo", "derender.learn.runs", "derender.report.run"):
         importlib.import_module(slow)  # once for both
-    for rank in "01":
-        own = common | {"RANK": rank, "LOCAL_RANK": rank}
-        work = partial(one_rank, own, commands, place / "found.json", port)
-        children.append(start(work, place / rank))
+    own = {rank: common | {"RANK": rank, "LOCAL_RANK": rank} for rank in "01"}
+    children = [start(partial(one_rank, own[rank], *given), place / rank) for rank in own]
     ended = [waited(child, 120) for child in children]
     printed = [(place / rank).read_text() for rank in "01"]
     assert ended == [0, 0], printed
