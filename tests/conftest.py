@@ -68,12 +68,13 @@ def tiny(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _searched_once():
-    """The detector of faces gives its answer again for pixels that it has searched before."""
+def _started_and_searched_once():
+    """Numba, started, renders few pixels, too; the detector of faces answers again for pixels it has seen."""
     module = import_module("derender.photo.faces")
     search = module._detected
     detected = lru_cache(128)(lambda pixels, shape: search(np.frombuffer(pixels, np.uint8).reshape(shape)))
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("derender.render.backends.FEW_PIXELS", 0)
         patch.setattr(module, "_detected", lambda photo: list(detected(photo.tobytes(), photo.shape)))
         yield
 

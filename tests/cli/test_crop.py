@@ -48,7 +48,7 @@ def test_the_part_is_found_told_and_drawn(photos, tmp_path, numbers):
 
 def test_detail_films_and_meshes_are_of_the_same_part(photos, tmp_path, numbers):
     words = ("-m", KNOWN, photos / "wide.png", "--frame", "auto")
-    words += ("--fit-steps", 0, "--texture", "original", "-o")
+    words += ("--fit-steps", 0, "--texture", "original", "--size", 64, "-o")
     few = ["--stills", "2", "--film", "none", "--like", photos / "wide.png"]
     relit, _ = numbers("relight", *words, tmp_path / "relit", *few)
     meshes, _ = numbers("mesh", *words, tmp_path / "meshes")
@@ -78,7 +78,7 @@ def test_noise_is_left_out_though_its_grey_is_near_to_any(tmp_path, numbers, ref
     noise = np.random.default_rng(0).integers(0, 256, (300, 300, 3), dtype=np.uint8)
     out = tmp_path / "lit.jpg"
     Image.fromarray(noise).save(tmp_path / "noise.png")
-    words = ("relight", "-m", KNOWN, tmp_path / "noise.png", "-o", out)
+    words = ("relight", "-m", KNOWN, tmp_path / "noise.png", "-o", out, "--fit-steps", 0)
     line = refused(*words)
     assert "no face is found; reconstructed worse than" in line and "fits better" not in line
     assert "with 0 % of its variance explained" in line and not out.exists()

@@ -62,7 +62,7 @@ def test_features_hold_fitted_scenes_where_steps_are_set(folder, tmp_path, capsy
 def test_images_are_made_of_fitted_scenes(fits, folder, tmp_path, command):
     given = [command, "-m", str(fits), str(folder / "000.png")]
     extra = ["--film", "none", "--stills", "2"] if command == "rotate" else []
-    for name, steps in (("plain", []), ("fitted", ["--fit-steps", "12"])):
+    for name, steps in (("plain", []), ("fitted", ["--fit-steps", "4"])):
         assert main([*given, *extra, "-o", str(tmp_path / name), *steps]) == 0
     one, two = (sorted((tmp_path / name / "000").iterdir()) for name in ("plain", "fitted"))
     assert [path.name for path in one] == [path.name for path in two]

@@ -112,7 +112,7 @@ def test_it_answers_until_ctrl_c_which_does_not_wait_for_a_running_fit(photos, t
         answer.value.close()
         connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=60)
         connection.request("POST", "/api/examples/0", headers={"X-Derender-Page": "1"})
-        time.sleep(3)
+        time.sleep(1)
     assert connection.getresponse().status == 500  # the fit was not waited for
     connection.close()
 

@@ -30,7 +30,7 @@ def problem(rows: int = 90, spread: float = 0.1):
 
 
 def compare(features, labels, **options):
-    return compare_clusterings(features, labels, controls=("noise",), resample_count=200, **options)
+    return compare_clusterings(features, labels, controls=("noise",), resample_count=50, **options)
 
 
 @settings(max_examples=40, deadline=None)

@@ -89,12 +89,12 @@ def test_each_picture_is_fitted_by_itself(maps, truth, wrong):
 
 def test_features_do_not_depend_on_neighbours_or_threads():
     """Encoders differ by rounding; 20 steps downhill would magnify it to a tenth if batches met there."""
-    images = torch.from_numpy(np.ascontiguousarray(faces.generate(12, 64, seed=3).images)).float() / 255
+    images = torch.from_numpy(np.ascontiguousarray(faces.generate(6, 64, seed=3).images)).float() / 255
     model = derender.load("rendered-faces-64")
     model = model.with_features(model.features.with_steps(20))
     threads, encoded = torch.get_num_threads(), {"geometry": 192, "albedo": 192}
     with torch.inference_mode():
-        together, alone = model.embed(images), [model.embed(one[None]) for one in images[:4]]
+        together, alone = model.embed(images), [model.embed(one[None]) for one in images[:2]]
         try:
             torch.set_num_threads(3 - min(threads, 2))
             otherwise = model.embed(images)
@@ -170,7 +170,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, tensors, told):
 
 
 def test_measured_directions_lead_further_than_the_coordinates_themselves(monkeypatch):
-    images = torch.from_numpy(np.ascontiguousarray(faces.generate(8, 64, seed=5).images)).float() / 255
+    images = torch.from_numpy(np.ascontiguousarray(faces.generate(4, 64, seed=5).images)).float() / 255
     along = derender.load("rendered-faces-64").fit_scenes(images, 12)
     method = "_measured_directions"
     monkeypatch.setattr(Fitting, method, lambda self, render, rates, sizes: torch.eye(len(rates)))

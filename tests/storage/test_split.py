@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from tests.cli.conftest import face_files
+from tests.cli.conftest import face_files, settings
 
 import derender
 from derender.cli import main
@@ -43,7 +43,7 @@ def test_copies_of_copies_have_the_parts_of_the_run(run, pictures, tmp_path):
     assert split_of(str(run)) == RECORD
     for copy, of in (("white", "run"), ("again", "white")):
         told = ["whiten", "-m", str(tmp_path / of), "-d", pictures, "-o", str(tmp_path / copy)]
-        told += ["--set", "pictures=8", "--set", "views=1", "--set", "directions=4", "--set", "spatial=false"]
+        told += settings("pictures=8", "views=1", "directions=4", "spatial=false", "examples=4")
         assert main(told) == 0
     assert main(["pack", "-m", str(tmp_path / "run"), "-o", str(tmp_path / "small")]) == 0
     every = read_images(pictures, 64)
@@ -53,11 +53,10 @@ def test_copies_of_copies_have_the_parts_of_the_run(run, pictures, tmp_path):
 
 
 def test_what_learnt_from_all_pictures_has_no_parts(run, pictures, tmp_path, capsys):
-    short = ["images=16", "batch_size=8", "fitted=8", "fit_steps=1", "whitening.pictures=0"]
-    sets = [word for setting in short for word in ("--set", setting)]
+    short = ("images=4", "batch_size=4", "fitted=4", "fit_steps=1", "whitening.pictures=0", "examples=4")
     for part in ("all", "train"):
         told = ["refine", "-m", str(run), "-d", pictures, "-o", str(tmp_path / part), "--part", part]
-        assert main([*told, *sets]) == 0
+        assert main([*told, *settings(*short)]) == 0
     assert split_of(str(tmp_path / "all")) is None and split_of(str(tmp_path / "train")) == RECORD
     capsys.readouterr()
     asked = ["evaluate", "reconstruction", "-m", str(tmp_path / "all"), "-d", pictures, "--part", "test"]

@@ -1,15 +1,13 @@
 """The two processes of test_distributed.py: commands, then a step on half a batch beside the whole one.
 
-The step runs in float64, where rounding cannot hide a difference.
-The first process writes what it found. Both are forked after their imports; their exit codes are printed.
+The step runs in float64, where rounding cannot hide a difference. The first process writes what it found.
 """
 
-import importlib
 import json
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -65,12 +63,12 @@ def largest_difference(own: float, ranks: Ranks) -> dict[str, float]:
     return {"terms": of_terms, "gradients": gradients, "loocc": whole_terms["loocc"]}
 
 
-def main(rank: str, place: str, found: str, commands: str, port: str) -> None:
-    os.environ |= {"RANK": rank, "LOCAL_RANK": rank}
-    printed = os.open(Path(place) / rank, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(printed, 1), os.dup2(printed, 2)
+def one_rank(environment: Mapping[str, str], commands: Sequence[list[str]], found: Path, port: str) -> int:
+    """In a process forked for it: what is printed goes to the file descriptor 2, exit codes among it."""
+    os.environ |= environment
+    sys.stdout = sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
     torch.set_num_threads(1)
-    for words in json.loads(commands):
+    for words in commands:
         sys.stderr.write(f"\nended with {command(words)}\n")
         sys.stderr.flush()
     os.environ["MASTER_PORT"] = port  # the last command has left its group
@@ -79,14 +77,6 @@ def main(rank: str, place: str, found: str, commands: str, port: str) -> None:
     ranks = Ranks(fabric.global_rank, fabric.world_size)
     result = {"count": ranks.count, "steps": [largest_difference(own, ranks) for own in (1.0, 0.3)]}
     if ranks.first:
-        Path(found).write_text(json.dumps(result))
+        found.write_text(json.dumps(result))
     leave()
-
-
-if __name__ == "__main__":
-    for slow in ("torch._dynamo", "derender.learn.runs", "derender.report.run"):
-        importlib.import_module(slow)
-    how = {"target": main, "daemon": True}
-    both = [get_context("fork").Process(args=(rank, *sys.argv[1:]), **how) for rank in "01"]
-    [one.start() for one in both], [one.join(110) for one in both]
-    sys.stdout.write(" ".join(str(one.exitcode) for one in both))
+    return 0

@@ -9,6 +9,7 @@ from derender.data.synthetic.settings import EffectSettings, FaceSettings
 from derender.model import Derenderer
 from derender.objectives.reconstruction import masked_l1
 from derender.render import Rendering
+from derender.scene import Scene
 from derender.scene.crop import CropSettings, crop_images
 from derender.training import distillation
 from derender.training.config import FeatureSettings
@@ -21,6 +22,17 @@ LESSONS = distillation.RefiningSettings(
 FEW = {"pictures": 16, "views": 2, "directions": 8, "spatial": False}
 PARTS = {"refining": LESSONS.model_dump(), "whitening": FEW, "fitting": {"examples": 16}}
 SHORT = distillation.RefineConfig.model_validate(PARTS)
+NONE = SHORT.whitening.model_copy(update={"pictures": 0})
+
+
+def untrained(renderer: str, count: int) -> tuple[Derenderer, torch.Tensor]:
+    """A small model that can fit scenes, and so many images of its 32 pixels."""
+    images = torch.from_numpy(faces.generate(count, image_size=32, seed=9).images)
+    settings = {"whitening": {"pictures": 0}, "fitting": {"examples": count, "coordinates": 4}}
+    sizes = {"image_size": 32, "width": 8, "light_width": 8}
+    start = Derenderer.from_preset("small", seed=0, renderer=renderer, **sizes).eval().requires_grad_(False)
+    how = SHORT.model_copy(update=FeatureSettings(**settings).__dict__)
+    return make_features(start, images, how), images
 
 
 def changed(**refining) -> distillation.RefineConfig:
@@ -41,20 +53,26 @@ def images():
 @pytest.fixture(scope="module")
 def refined(model, images):
     """Taught by few images of a kind the model does not know, and measured on the same."""
-    return distillation.refine(model, images, images, changed(images=320), seed=5)
+    lessons = changed(images=120, batch_size=4, learning_rate=2e-4)
+    return distillation.refine(model, images[:8], images[:8], lessons, seed=5)
+
+
+@pytest.fixture(scope="module")
+def meant(model, images) -> Scene:
+    """Scenes fitted to the images."""
+    return distillation.fit_scenes(model, images, 2, print).scene(model.fitting.maps)
 
 
 def test_what_is_read_comes_nearer_to_what_fitting_finds(refined):
     for name in ("depth", "albedo", "light", "camera"):
-        gap = refined.gaps[name]
-        assert gap["now"] < 0.8 * gap["before"], name
+        assert refined.gaps[name]["now"] < 0.8 * refined.gaps[name]["before"], name
     assert refined.errors["fitted"] < refined.errors["now"] < refined.errors["before"]
 
 
-def test_the_same_seed_distils_the_same_and_nothing_else_is_touched(model, images):
+def test_the_same_seed_distils_the_same_and_nothing_else_is_touched():
+    model, few = untrained("phong", 8)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     state = torch.random.get_rng_state()
-    few = images[:8]
     one, again = (distillation.refine(model, few, few, changed(images=16), seed=5) for _ in range(2))
     assert torch.equal(torch.random.get_rng_state(), state)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
@@ -78,10 +96,8 @@ def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refine
     assert features["geometry"].shape == (3, 256)
 
 
-def test_renderings_come_with_the_scene_they_show(model, images):
-    pictures = images[:16].float() / 255
-    fitted = distillation.fit_scenes(model, images[:16], 2, print)
-    meant = fitted.scene(model.fitting.maps)
+def test_renderings_come_with_the_scene_they_show(model, images, meant):
+    pictures = images.float() / 255
     half = changed(rendered=0.5, exchanged=0.5)
     shown, scene = distillation.examples(model, pictures, meant, half, torch.Generator().manual_seed(0))
     assert shown.shape == pictures.shape and len(scene) == 16
@@ -101,12 +117,11 @@ def test_renderings_come_with_the_scene_they_show(model, images):
 
 def framed(**refining) -> distillation.RefineConfig:
     """Lessons half of which are shown in other frames."""
-    return changed(reframed=0.5, **refining).model_copy(update={"reframe": FRAMES})
+    return changed(reframed=0.5, **refining).model_copy(update={"reframe": FRAMES, "whitening": NONE})
 
 
-def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images):
-    pictures = images[:16].float() / 255
-    meant = distillation.fit_scenes(model, images[:16], 2, print).scene(model.fitting.maps)
+def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, images, meant):
+    pictures = images.float() / 255
     draw = torch.Generator().manual_seed(0)
     shown, scene = distillation.examples(model, pictures, meant, framed(rendered=0), draw)
     away = scene.camera[:, 5] - meant.camera[:, 5]
@@ -124,8 +139,8 @@ def test_pictures_in_other_frames_come_with_the_camera_that_sees_them_so(model, 
 
 
 def test_a_copy_distilled_so_steps_back_from_smaller_faces(model, images):
-    lessons = framed(images=240, rendered=0, fit_steps=4, learning_rate=1.5e-3)
-    learned = distillation.refine(model, images, images, lessons, seed=5).model
+    lessons = framed(images=100, batch_size=4, rendered=0, learning_rate=1.5e-3)
+    learned = distillation.refine(model, images, images[:2], lessons, seed=5).model
     assert learned.settings.ranges.translation_z == pytest.approx(0.9 / 0.75)
     assert model.settings.ranges.translation_z == 0
     pictures = images.float() / 255
@@ -138,12 +153,7 @@ def test_a_copy_distilled_so_steps_back_from_smaller_faces(model, images):
 @pytest.mark.parametrize("renderer", ["phong+haze", "sh"])
 def test_further_factors_are_learnt_too(renderer):
     """From an untrained model, all of whose scenes are far from the fitted ones."""
-    images = torch.from_numpy(faces.generate(16, image_size=32, seed=9).images)
-    settings = {"whitening": {"pictures": 0}, "fitting": {"examples": 16, "coordinates": 4}}
-    sizes = {"image_size": 32, "width": 8, "light_width": 8}
-    start = Derenderer.from_preset("small", seed=0, renderer=renderer, **sizes).eval().requires_grad_(False)
-    how = SHORT.model_copy(update=FeatureSettings(**settings).__dict__)
-    start = make_features(start, images, how)
+    start, images = untrained(renderer, 16)
     refined = distillation.refine(start, images, images, changed(images=200, learning_rate=1e-3), seed=5)
     extra = {row.parameter for row in start.factors} - {"depth", "albedo", "light", "camera"}
     assert extra and {row.parameter for row in start.factors} == set(refined.gaps)
@@ -171,8 +181,8 @@ def test_weights_that_are_no_numbers_are_an_error(model, images):
     broken = derender.load("rendered-faces-64")
     broken.nets["confidence"].requires_grad_(False)
     next(broken.nets["confidence"].parameters()).fill_(float("nan"))
-    with pytest.raises(ValueError, match="NaN or infinite after 32 images"):
-        distillation.refine(broken, images, images, changed(images=32, fit_steps=1))
+    with pytest.raises(ValueError, match="NaN or infinite after 8 images"):
+        distillation.refine(broken, images[:8], images[:1], changed(images=8, fit_steps=1))
 
 
 def test_only_clear_fits_are_distilled():

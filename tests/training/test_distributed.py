@@ -1,18 +1,18 @@
 """Two processes train as one does: same losses, same gradients, same images, one voice."""
 
+import importlib
 import json
-import os
 import re
 import socket
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from tests.cli.conftest import noise
+from tests.training.one_rank import one_rank
+from tests.trust.apart import start, waited
 
 from derender.data import read_images
 from derender.training import resolve, train
@@ -20,6 +20,7 @@ from derender.training.batches import Batches
 from derender.training.distributed import Ranks
 from derender.training.run_folder import read_metrics
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # while threads run
 TINY = [
     *("image_size=32", "width=8", "light_width=4", "batch_size=8"),
     *("perceptual=self", "self_features_steps=2"),
@@ -34,18 +35,21 @@ def free_port() -> str:
         return str(free.getsockname()[1])
 
 
-def two_processes(*arguments: str) -> list[tuple[int, str]]:
-    """Run one_rank.py with these arguments as torchrun would, twice; exit codes and what was printed."""
+def two_processes(commands: list[list[str]], place: Path) -> list[str]:
+    """What each of two processes prints that are begun as by torchrun; the first writes found.json."""
     common = {
-        **os.environ, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "test",
+        "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "test",
         "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "GLOO_SOCKET_IFNAME": "lo", "GROUP_RANK": "0",
-        "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
     }  # fmt: skip
-    with tempfile.TemporaryDirectory() as place:
-        words = [sys.executable, str(Path(__file__).with_name("one_rank.py")), place, *arguments]
-        ended = subprocess.run(words, env=common, capture_output=True, text=True, timeout=120)
-        codes = map(int, ended.stdout.split())
-        return [(code, (Path(place) / rank).read_text()) for rank, code in zip("01", codes, strict=True)]
+    given = (commands, place / "found.json", free_port())
+    for slow in ("torch._dynamo", "derender.learn.runs", "derender.report.run"):
+        importlib.import_module(slow)  # once for both
+    own = {rank: common | {"RANK": rank, "LOCAL_RANK": rank} for rank in "01"}
+    children = [start(partial(one_rank, own[rank], *given), place / rank) for rank in own]
+    ended = [waited(child, 120) for child in children]
+    printed = [(place / rank).read_text() for rank in "01"]
+    assert ended == [0, 0], printed
+    return printed
 
 
 @pytest.fixture
@@ -78,9 +82,8 @@ def told(folder, tmp_path_factory) -> tuple[dict, list[list[str]], Path]:
         [*train_words, "--out", str(place / "refused"), *settings("batch_size=7")],
         [*train_words, "--out", str(place / "run"), *settings("images=32")],
     ]
-    ended = two_processes(str(place / "found.json"), json.dumps(commands), free_port())
-    assert [code for code, _ in ended] == [0, 0], ended
-    printed = [re.split(r"(?<=\nended with \d)\n", words)[:2] for _, words in ended]
+    ended = two_processes(commands, place)
+    printed = [re.split(r"(?<=\nended with \d)\n", words)[:2] for words in ended]
     return json.loads((place / "found.json").read_text()), printed, place
 
 

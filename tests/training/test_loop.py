@@ -46,22 +46,23 @@ def test_a_run_leaves_everything_named_in_the_design(pictures, tmp_path):
         return Image.fromarray(grey.byte().cpu().numpy())
 
     seen: list[Progress] = []
-    config = resolve("small", [*TINY, "images=128", "whitening.pictures=16"])
+    often = ["validate_every=16", "sample_every=32", "whitening.pictures=16"]
+    config = resolve("small", [*TINY, *often, "images=64"])
     result = train(config, pictures, tmp_path / "run", sample_sheet=sheet, progress=seen.append)
     run = tmp_path / "run"
     assert result.stopped == "images"
-    assert result.images == 128
+    assert result.images == 64
     assert read_config(run) == config
     environment = json.loads((run / "environment.json").read_text())
     assert environment["data"]["pictures"] == 60
     assert environment["packages"]["torch"]
-    assert sorted(path.name for path in (run / "samples").iterdir()) == ["000000064.png", "000000128.png"]
+    assert sorted(path.name for path in (run / "samples").iterdir()) == ["000000032.png", "000000064.png"]
     assert {path.name for path in (run / "checkpoints").iterdir()} == {"last", "previous", "best"}
     assert derender.load(run).embed(torch.rand(2, 3, 32, 32))["geometry"].shape == (2, 256)
     kinds = [row["kind"] for row in read_metrics(run)]
     assert kinds.count("validation") == 4
     assert "train" in kinds
-    assert [progress.done for progress in seen if progress.phase == "train"] == list(range(8, 129, 8))
+    assert [progress.done for progress in seen if progress.phase == "train"] == list(range(8, 65, 8))
     assert not [path for path in run.rglob("*") if path.suffix in (".pkl", ".pt", ".pth")]
 
 
@@ -226,8 +227,8 @@ def test_a_resumed_run_whose_best_checkpoint_is_damaged_leaves_the_model_alone(w
 
 
 def test_a_run_without_held_out_pictures_keeps_its_last_weights(pictures, tmp_path):
-    config = resolve("small", [*WORSENING, "split=[1,0,0]"])
-    assert train(config, pictures, tmp_path / "run").model_images == 96
+    config = resolve("small", [*WORSENING, "split=[1,0,0]", "images=48"])
+    assert train(config, pictures, tmp_path / "run").model_images == 48
     assert_model_is_of(tmp_path / "run", "last")
 
 

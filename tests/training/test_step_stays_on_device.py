@@ -77,7 +77,7 @@ def test_the_loop_reads_the_notes_of_many_steps_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(loop._Run, "read_notes", lambda run: read.append(len(run.notes)) or read_notes(run))
     monkeypatch.setattr(Watcher, "look", lambda self, at, *note: looked.append(at) or look(self, at, *note))
     tiny = ["image_size=32", "width=4", "light_width=4", "perceptual=none", "batch_size=2"]
-    tiny += ["split=[0.8,0.2,0]", "images=80", "whitening.pictures=0", "fitting.examples=0"]
+    tiny += ["split=[0.8,0.2,0]", "images=40", "whitening.pictures=0", "fitting.examples=0"]
     train(resolve("small", tiny), noise_set(20), tmp_path / "run")
     assert not any(asked[1:])  # in the first step tables are made
-    assert read == [16, 16, 8] and looked == list(range(2, 82, 2))
+    assert read == [16, 4] and looked == list(range(2, 42, 2))

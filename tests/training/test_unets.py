@@ -33,7 +33,7 @@ def joint_maps(model, images) -> torch.Tensor:
     return model.unet_decoder([torch.cat(level, dim=1) for level in levels])
 
 
-SHORT = unets.UNetSettings(images=96, batch_size=8, unet_width=4, learning_rate=3e-3)
+SHORT = unets.UNetSettings(images=48, batch_size=8, unet_width=4, learning_rate=3e-3)
 
 
 @pytest.fixture(scope="module")

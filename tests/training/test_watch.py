@@ -156,7 +156,7 @@ def test_a_memory_that_no_watcher_gave_is_refused(memory):
         Watcher.remembering(RANGES, BATCH, memory)
 
 
-COLLAPSING = ["image_size=32", "width=8", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]
+COLLAPSING = ["image_size=32", "width=4", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]
 COLLAPSING += ["curvature_weight=0", "learning_rate=1e-2", "weight_decay=0", "warmup_images=0"]
 COLLAPSING += ["final_rate=1", "whitening.pictures=0", "fitting.examples=0"]
 SOONER = 8
@@ -182,7 +182,7 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypa
     assert results & {"saturated depth", "torn depth", "view at its bound"}
     rows = read_metrics(tmp_path / "run")
     errors = [row["l1"] for row in rows if row["kind"] == "train"]
-    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.44 with torch 2.15
+    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.38 with torch 2.15
     assert results <= set(rows[-1])
 
 
@@ -197,7 +197,7 @@ def test_the_last_good_state_is_kept_whatever_the_interval(tmp_path, monkeypatch
 
     monkeypatch.setattr(Watcher, "judge", ill)
     run = tmp_path / "run"
-    result = train(resolve("small", [*COLLAPSING, "learning_rate=1e-4", "width=4"]), generated(60), run)
+    result = train(resolve("small", [*COLLAPSING, "learning_rate=1e-4", "batch_size=32"]), generated(60), run)
     assert (result.stopped, result.images) == ("collapse", 704)
     assert [row["images"] for row in read_metrics(run) if row["kind"] == "validation"] == [320]
     assert json.loads((run / "checkpoints/last/state.json").read_text())["state"]["images"] == 320
