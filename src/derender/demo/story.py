@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +83,7 @@ def opening(address: str | Path | None = None, side: int = 512) -> dict[str, Any
     shown, source = [], "your photographs"
     if address is not None:
         read = read_images(address, side, limit=EXAMINED).images.transpose(0, 2, 3, 1)
-        shown = list(islice(filter(find_faces, read), SHOWN))
+        shown = [photo for _, photo in zip(range(SHOWN), filter(find_faces, read), strict=False)]
     if not shown:
         shown, source = portraits(side), "generated portraits, which show no real person"
     model = load(EDITOR)
@@ -102,7 +101,8 @@ def opening(address: str | Path | None = None, side: int = 512) -> dict[str, Any
         return image_bytes(Image.fromarray(np.ascontiguousarray(photo)), "JPEG", quality=88)
 
     files = {name: [jpeg(one) for one in edited] for name, edited in columns.items()}
-    return {"columns": files, "names": [f"photograph {row + 1}" for row in range(len(shown))], "source": source}
+    names = [f"photograph {row + 1}" for row in range(len(shown))]
+    return {"columns": files, "names": names, "source": source}
 
 
 def portraits(side: int) -> list[UInt8[np.ndarray, "h w 3"]]:
