@@ -28,7 +28,7 @@ from derender.data import open_source
 from derender.data.image import decode_whole
 from derender.data.synthetic import cars
 from derender.photo import Frame, found_frame
-from derender.photo.faces import UTKFACE, detector, find_faces
+from derender.photo.faces import SMALLEST_FACE, UTKFACE, detector, find_faces
 
 SIDES, ROLL_DEG = (40, 800), 30
 BANDS = (40, 80, 160, 320, 801)
@@ -152,7 +152,7 @@ def of_package(pixels: np.ndarray) -> list[Eyes]:
     """MTCNN once, at the photograph's own size."""
     return [
         np.array([result["keypoints"][name] for name in ("left_eye", "right_eye")], float)
-        for result in detector().detect_faces(pixels)
+        for result in detector(SMALLEST_FACE).detect_faces(pixels)
     ]
 
 

@@ -72,10 +72,10 @@ def _started_and_searched_once():
     """Numba, started, renders few pixels, too; the detector of faces answers again for pixels it has seen."""
     module = import_module("derender.photo.faces")
     search = module._detected
-    detected = lru_cache(128)(lambda pixels, shape: search(np.frombuffer(pixels, np.uint8).reshape(shape)))
+    detected = lru_cache(128)(lambda data, shape, *of: search(np.frombuffer(data, "u1").reshape(shape), *of))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("derender.render.backends.FEW_PIXELS", 0)
-        patch.setattr(module, "_detected", lambda photo: list(detected(photo.tobytes(), photo.shape)))
+        patch.setattr(module, "_detected", lambda one, *of: list(detected(one.tobytes(), one.shape, *of)))
         yield
 
 

@@ -112,8 +112,8 @@ def test_the_sheet_has_a_column_for_each_answer_and_the_legend_below():
 
 
 def test_a_chart_as_a_picture_has_a_ground_and_as_svg_has_none():
-    svg, png = side_by_side({"light": 0.5}, lambda axes, width: axes.barh([0], [width]), "share", (3, 2))
-    with Image.open(BytesIO(png)) as picture:
+    chart = side_by_side({"light": 0.5}, lambda axes, width: axes.barh([0], [width]), "share", (3, 2))
+    with Image.open(BytesIO(chart.png())) as picture:
         corner, alpha = picture.convert("RGBA").getpixel((1, 1)), picture.convert("RGBA").getchannel("A")
     assert corner == (255, 255, 255, 255) and alpha.getextrema() == (255, 255)
-    assert "#ffffff" not in svg and "currentColor" in svg
+    assert "#ffffff" not in chart.svg() and "currentColor" in chart.svg()

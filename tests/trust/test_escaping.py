@@ -14,7 +14,7 @@ from derender.evaluation.linear_task import Rows, task_of
 from derender.evaluation.score_table import Column, Row, ScoreTable
 from derender.interpretation import cluster_shares, explain_labels, explanation, pair_parts
 from derender.report import charts
-from derender.report.explanation import explanation_page, share_chart
+from derender.report.explanation import explanation_page
 from derender.report.page import Page
 from derender.report.protocols import comparison_page
 from derender.report.run import doctor_page, run_page
@@ -84,7 +84,7 @@ def test_explanation(evil):
     pair = (evil, evil), pair_parts(features, 0, 1)
     model, clusters = SimpleNamespace(source=evil), cluster_shares(features, np.arange(90) % 2)
     result = explanation.Explained(shares, model, images, task, rows, clusters, pair)
-    harmless(explanation_page(result, share_chart(shares)[0], sheets), evil)
+    harmless(explanation_page(result, sheets), evil)
 
 
 def test_a_name_with_dollars_is_text_and_no_formula():

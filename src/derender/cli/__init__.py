@@ -45,7 +45,7 @@ def _options(
 
 for module in (
     "demo", "prepare", "train", "copies", "models", "embed", "explain", "finetune", "importing",
-    "compare", "report", "decompose", "edits", "search", "view", "bench", "evaluate.features",
+    "compare", "report", "decompose", "edits", "search", "view", "evaluate.features",
     "evaluate.encoders", "evaluate.scenes", "evaluate.photographs", "evaluate.robustness", "synth",
 ):  # fmt: skip
     import_module(f"derender.cli.{module}")

@@ -1,4 +1,4 @@
-"""`derender demo`: the whole story on built-in data, ending with the name of one report."""
+"""`derender demo` and `bench`: the whole story on built-in data, ending with one report; and speed here."""
 
 import time
 from itertools import count
@@ -53,3 +53,22 @@ def demo(
     notice(f"done in {duration(time.monotonic() - began)}; the model is in {folder / 'run'}")
     result(f"report {folder / 'report.html'}", json_file)
     write_json(json_file, values)
+
+
+@command("bench", "bench --quick --json speed.json")
+def bench(
+    quick: bool = option(False, "One small round: a minute.", "--quick"), json_file: options.Json = None
+) -> None:
+    """Measure speed on this machine, as ratios: rasteriser, embedding beside training, clustering."""
+    from derender.speed import bench as measure
+
+    with progress_bar("measuring", unit="pairs") as report:
+        measured = measure(quick, report)
+    for row in measured["rows"]:
+        speeds = f"{row['ours_per_second']:,.1f} against {row['theirs_per_second']:,.1f} {row['unit']}/s"
+        spread = f"rounds {row['least']:.2f}..{row['most']:.2f}"
+        result(f"{row['what']}: {row['ratio']:.2f}x ({speeds}; {spread})", json_file)
+    share, seconds, unaided = (measured["waiting"][key] for key in ("share", "seconds", "share_unaided"))
+    spent = f"{share:.2%} of {seconds:.1f} s spent waiting for data ({unaided:.2%} without reading ahead)"
+    result(f"training, preset small, images in a mapped file: {spent}", json_file)
+    write_json(json_file, measured)

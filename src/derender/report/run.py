@@ -34,7 +34,7 @@ from derender.model import Derenderer
 from derender.overrides import settings_by_name
 from derender.report import charts, colours
 from derender.report.decomposition import COLUMN_MEANING, decompose_images
-from derender.report.explanation import share_chart, share_values
+from derender.report.explanation import share_values
 from derender.report.opening import readable
 from derender.report.page import Page
 from derender.report.panel import labelled_grid, strip
@@ -341,7 +341,7 @@ def _explained(subject: Subject) -> Values:
         raise ValueError(f"no label of 2 to {MOST_CLASSES} classes (labels: {known}): name one")
     sample = _sample(subject.held_out, EXPLAINED)
     result = explain(replace(sample, partition=None), subject.model, names, seeds=1).shares
-    shares = share_values(result, share_chart(result)[0])
+    shares = share_values(result)
     return {"count": f"{len(sample):,}", "names": ", ".join(names), "shares": shares}
 
 
