@@ -1,7 +1,7 @@
-"""Of faces none is searched for here: Triton's process starts sooner without their detector."""
+"""Few pixels are rendered as for users, and no face is searched for: the process of Triton starts sooner."""
 
 import pytest
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _searched_once(): ...
+def _started_and_searched_once(): ...
