@@ -1,4 +1,4 @@
-"""`derender demo` and `bench`: the whole story on built-in data, ending with one report; and speed here."""
+"""`derender demo` and `bench`: the whole story on built-in data in one report, and ratios of speeds."""
 
 import time
 from itertools import count
