@@ -61,7 +61,7 @@ def test_copies_are_dropped_by_content(tree, encoded):
     assert images.files == ("cat/1.png", "cat/2.png")
     copies = [(row.file, row.first) for row in images.duplicates]
     assert copies == [("dog/1.bmp", "cat/1.png"), ("dog/2.png", "cat/1.png")]
-    assert "2 identical copies dropped" in images.describe()
+    assert "2 identical copies dropped" in images.describe() == repr(images)
     kept = read_images(source, 12, keep_duplicates=True)
     assert len(kept) == 4 and kept.duplicates == images.duplicates
     assert "2 identical copies kept" in kept.describe()

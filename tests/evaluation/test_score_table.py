@@ -75,7 +75,7 @@ def test_markdown_is_the_table():
     assert lines[5] == r"| *pixels \| raw* | 0.500 | **1.0** | - |"
     assert lines[6].endswith(r"| - | 3.0 | \*x\* |")
     assert lines[8] == "accuracy: 0 to 1"
-    assert Scores([TABLE, TABLE], {}).to_markdown().count("| features |") == 2
+    assert repr(Scores([TABLE, TABLE], {})).count("| features |") == 2
 
 
 def test_latex_is_the_table():

@@ -149,7 +149,7 @@ def test_concatenate_follows_the_order_asked_for_and_names_the_nearest():
     both = table.concatenate(("albedo", "geometry"))
     np.testing.assert_array_equal(both[:, :3], table.factors["albedo"])
     np.testing.assert_array_equal(both[:, 3:], table.factors["geometry"])
-    assert both.dtype == np.float32
+    assert both.dtype == np.float32 and repr(table) == "5 rows: geometry 4, albedo 3; labels: none"
     np.testing.assert_array_equal(table.concatenate("albedo"), table.factors["albedo"])
     np.testing.assert_array_equal(table.concatenate(), table.concatenate(("geometry", "albedo")))
     with pytest.raises(ValueError, match=r"factor 'albdo'; did you mean 'albedo'\?; there is geometry"):

@@ -61,8 +61,7 @@ def split_indices(
             raise ValueError(f"expected one group for each of {len(names)} images, got {len(groups)}")
         rows = zip(names, groups, strict=True)
         keys = [f"file {name}" if str(one) in ("", "nan") else f"group {one}" for name, one in rows]
-    salted = (f"{seed}\0{key}".encode("utf-8", "surrogateescape") for key in keys)
-    digests = [hashlib.sha256(one).hexdigest() for one in salted]
+    digests = [hashlib.sha256(f"{seed}\0{key}".encode(errors="surrogateescape")).hexdigest() for key in keys]
     exact = len(names) * np.array(fractions)
     counts = (exact + 1e-9).astype(int)
     largest_remainders = np.argsort(counts - exact, kind="stable")[: len(names) - counts.sum()]
@@ -153,8 +152,7 @@ class ImageSet:
     def describe(self) -> str:
         """One line: how many images, of which layout, what was left out."""
         parts = [f"{counted(len(self), 'images')} from {self.source} ({self.layout})"]
-        if self.skipped:
-            parts.append(f"{len(self.skipped):,} skipped")
+        parts += [f"{len(self.skipped):,} skipped"] if self.skipped else []
         if self.duplicates:
             verb = "kept" if {row.file for row in self.duplicates} <= set(self.files) else "dropped"
             parts.append(f"{len(self.duplicates):,} identical copies {verb}")
@@ -163,6 +161,8 @@ class ImageSet:
         if len(partly) > 3:
             partly[2:] = [f"{len(partly) - 2} more labels in part unknown"]
         return ", ".join([*parts, *partly])
+
+    __repr__ = describe
 
 
 def read_images(

@@ -199,7 +199,7 @@ class Scores:
         """Every table, one after another."""
         return "\n".join(table.to_markdown() for table in self.tables)
 
-    __str__ = to_markdown
+    __str__ = __repr__ = _repr_markdown_ = to_markdown
 
     def to_latex(self) -> str:
         """Every table environment, one after another."""

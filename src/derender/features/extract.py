@@ -105,5 +105,4 @@ def model_facts(model: Any, source: str, layout: str) -> dict[str, Any]:
 
 def table_labels(images: Any) -> dict[str, np.ndarray]:
     """An image set's labels, and the owners' split as one more label ``partition`` where there is one."""
-    owners = {} if images.partition is None else {"partition": images.partition}
-    return {**owners, **images.labels}
+    return ({} if images.partition is None else {"partition": images.partition}) | dict(images.labels)

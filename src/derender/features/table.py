@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from derender.data import missing, suggestion
+from derender.storage.places import counted
 
 
 def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
@@ -51,10 +52,8 @@ class FeatureTable:
     def __post_init__(self) -> None:
         factors = {name: np.ascontiguousarray(values, np.float32) for name, values in self.factors.items()}
         labels = {name: np.asarray(values) for name, values in self.labels.items()}
-        object.__setattr__(self, "files", tuple(str(file) for file in self.files))
-        object.__setattr__(self, "factors", factors)
-        object.__setattr__(self, "labels", labels)
-        object.__setattr__(self, "origin", dict(self.origin))
+        given = {"factors": factors, "labels": labels, "origin": dict(self.origin)}
+        vars(self).update(given, files=tuple(map(str, self.files)))
         if not factors:
             raise ValueError("a feature table needs at least one factor")
         if twice := set(factors) & set(labels) or {"file"} & {*factors, *labels}:
@@ -70,6 +69,10 @@ class FeatureTable:
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def __repr__(self) -> str:
+        sizes = (f"{name} {values.shape[1]}" for name, values in self.factors.items())
+        return f"{counted(len(self), 'rows')}: {', '.join(sizes)}; labels: {', '.join(self.labels) or 'none'}"
 
     def concatenate(self, factors: Sequence[str] | None = None) -> np.ndarray:
         """Features of several factors side by side, (N, sum of D) float32; all of them by default."""
@@ -107,14 +110,13 @@ class FeatureTable:
         total = {name: np.zeros((len(number), values.shape[1])) for name, values in table.factors.items()}
         for name, values in table.factors.items():
             np.add.at(total[name], group, values)
-        sizes = np.bincount(group, minlength=len(number))[:, None]
 
         def constant(column: np.ndarray) -> bool:
             return np.array_equal(column[first][group], column, equal_nan=column.dtype.kind == "f")
 
         return type(self)(
             tuple("/".join(map(str, key)) for key in number),
-            {name: values / sizes for name, values in total.items()},
+            {name: values / np.bincount(group)[:, None] for name, values in total.items()},
             {name: column[first] for name, column in table.labels.items() if constant(column)},
             {**self.origin, "mean_by": list(labels)},
         )
@@ -140,7 +142,6 @@ class FeatureTable:
 def check_finite(factors: Mapping[str, np.ndarray], files: Sequence[str]) -> None:
     """A feature that is no finite number is an error that names the first image concerned."""
     for name, values in factors.items():
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
+        if not (finite := np.isfinite(values).all(axis=1)).all():
             rows = f"{int((~finite).sum())} of {len(values)} rows, first in {files[int(np.argmin(finite))]}"
             raise ValueError(f"factor {name!r} is not finite in {rows}: drop these, or check the model")
