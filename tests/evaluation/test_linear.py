@@ -79,8 +79,8 @@ def test_the_owners_test_part_and_groups_are_kept():
     partition = np.array(["train", "test", "validation", "train"])[np.arange(160) % 4]
     rows = choose_rows(task, files(160), (10,), (0,), partition=partition)
     assert (partition[rows.test] == "test").all() and len(rows.test) == 40
-    people = np.arange(160) // 8
-    rows = choose_rows(task, files(160), (50,), (0,), groups=people)
+    assert list(choose_rows(task, files(160), partition=partition).train) == [100]
+    rows = choose_rows(task, files(160), (50,), (0,), groups=(people := np.arange(160) // 8))
     assert not set(people[rows.test]) & set(people[rows.train[50][0]])
 
 

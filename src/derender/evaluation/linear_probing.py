@@ -31,7 +31,7 @@ from derender.evaluation import bootstrap, feature_rows
 from derender.evaluation import linear_probes as probes
 from derender.evaluation.linear_task import Rows, Task, choose_rows, count_scores, mean_precision, task_of
 from derender.evaluation.memory import Memory
-from derender.evaluation.options import Options
+from derender.evaluation.options import COUNTS, Options
 from derender.evaluation.score_table import Column, Scores, ScoreTable, judged_tables
 from derender.features import model_fingerprint, named
 from derender.inputs import Progress, device_named
@@ -52,7 +52,7 @@ def linear(
     label: str | Sequence[str] | None = None,
     *,
     attributes: bool = False,
-    counts: Sequence[int] = (100, 500, 1_000),
+    counts: Sequence[int] = COUNTS,
     heads: Sequence[str] = probes.HEADS,
     seeds: int = 5,
     test_fraction: float = 0.5,
@@ -70,7 +70,7 @@ def linear(
         features: a feature table or its ``.parquet`` file; a model or its name, with ``images``.
         label: one column of classes, or columns of two values.
         attributes: probe every yes/no label instead of ``label``.
-        counts: numbers of labelled rows to learn from.
+        counts: numbers of labelled rows to learn from; of the default ones those that there are.
         heads: probes: "linear" (the paper's), "centred", "logistic", "k-NN".
         seeds: random training subsets.
         test_fraction: share of the rows that is tested.
@@ -291,8 +291,7 @@ def finetune(
 
     generator = torch.Generator().manual_seed(seed)
     targets = torch.from_numpy(task.targets).float().to(device)
-    first = embed(rows[:2])
-    if not first.requires_grad:
+    if not (first := embed(rows[:2])).requires_grad:
         raise ValueError(f"features of {type(model).__name__} have no gradient: leave it out of finetune")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

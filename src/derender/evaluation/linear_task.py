@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from derender.data import split_indices
+from derender.evaluation.options import COUNTS
 from derender.features import missing
 
 
@@ -69,7 +70,7 @@ def task_of(labels: Mapping[str, np.ndarray]) -> Task:
 def choose_rows(
     task: Task,
     files: Sequence[str],
-    counts: Sequence[int] = (100, 500, 1_000),
+    counts: Sequence[int] = COUNTS,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     **how: Any,
 ) -> Rows:
@@ -77,10 +78,11 @@ def choose_rows(
     pool, test = divide_rows(task, files, **how)
     if not len(seeds):
         raise ValueError("a linear probe needs at least one seed")
+    if tuple(counts) == COUNTS:
+        counts = [count for count in COUNTS if count <= len(pool)] or [len(pool)]
     if not len(counts) or min(counts) < 2 or max(counts) > len(pool) or len(test) < 2:
-        have = f"{len(pool)} can be learned from and {len(test)} are tested"
-        asked = f"{', '.join(map(str, counts)) or 'no'} labelled rows"
-        raise ValueError(f"asked to learn from {asked}: {have}; counts must lie in 2..{len(pool)}")
+        got = f"{len(pool)} can be learned from and {len(test)} are tested; counts must lie in 2..{len(pool)}"
+        raise ValueError(f"asked to learn from {', '.join(map(str, counts)) or 'no'} labelled rows: {got}")
     orders = [np.random.default_rng(seed).permutation(pool) for seed in seeds]
     return Rows(test, {count: np.stack([order[:count] for order in orders]) for count in counts})
 
@@ -110,9 +112,8 @@ def divide_rows(
     if groups is not None and task.kind == "classes" and len(learn) and len(test):
         shown, asked = (np.any(task.targets[rows] > 0, axis=0) for rows in (learn, test))
         if not (shown & asked).any():
-            why = "rows of a group stay on one side, and these groups hold whole classes"
             what = f"none of the {int(asked.sum())} classes tested is learned from"
-            raise ValueError(f"{what}: {why}; choose other --groups, or none")
+            raise ValueError(f"{what}: these groups hold whole classes; choose others, or none")
     return learn, test
 
 
@@ -125,8 +126,7 @@ def _column(values: np.ndarray, name: str) -> tuple[list[Any], np.ndarray]:
         raise ValueError(f"a linear probe needs at least two classes, {have}: choose another label column")
     if counts.min() < 2:
         what = f"class {distinct.tolist()[counts.argmin()]!r} of label {name!r} has one row"
-        fix = "leave this class out (where there is --min-count, give 2), or choose another label"
-        raise ValueError(f"{what}, which cannot be both learned and tested: {fix}")
+        raise ValueError(f"{what}, to learn from or to test: leave it out (min_count=2), or choose another")
     return distinct.tolist(), numbers
 
 

@@ -14,6 +14,7 @@ from derender.evaluation.memory import Memory, memory_in
 from derender.inputs import Progress, as_images
 
 DEFAULT_FACTORS = ("geometry", "albedo")
+COUNTS = (100, 500, 1_000)  # labelled rows that linear heads learn from: of these those that there are
 NAMED = 5  # so many skipped images are named
 FORMER = {"resample_count": "resamples", "memory": "cache"}  # former keywords, taken still, and today's
 

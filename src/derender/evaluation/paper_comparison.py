@@ -15,7 +15,7 @@ from derender.evaluation.clustering import clustering_tables, compare_clustering
 from derender.evaluation.clustering_methods import METHODS
 from derender.evaluation.clustering_scores import CLUSTER_COLUMNS
 from derender.evaluation.linear_probing import FINETUNED, LinearComparison, compare_prepared, linear_tables
-from derender.evaluation.options import Options
+from derender.evaluation.options import COUNTS, Options
 from derender.evaluation.paper_tables import ATTRIBUTES, TABLES, PaperRow, beside_the_paper
 from derender.evaluation.score_table import Column, Row, Scores, ScoreTable, interval_cells, scored_table
 from derender.evaluation.segmentation import SegmentSettings, segment
@@ -30,7 +30,7 @@ def compare(
     images: ImageSet | str | Path | None = None,
     *,
     method: str = "ward",
-    counts: Sequence[int] = (100, 500, 1_000),
+    counts: Sequence[int] = COUNTS,
     seeds: int = 5,
     finetune: bool = False,
     supervised: bool = False,
