@@ -12,10 +12,10 @@ import pytest
 from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 
 BUDGET = {  # lines, files
-    "data": (6_476, 30),
+    "data": (6_480, 30),
     "evaluation": (6_897, 32),
     "report": (3_694, 21),
-    "cli": (2_081, 28),
+    "cli": (2_077, 28),
     "training": (3_443, 19),
     "baselines": (2_308, 11),
     "render": (1_658, 15),

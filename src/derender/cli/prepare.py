@@ -9,7 +9,6 @@ from derender.cli.console import notice, progress_bar, report_images
 from derender.cli.options import DataOptions, OutFolder, Output, Seed, command, option
 
 MODEL = "Cut as this model of faces was trained, and reject faces that it reconstructs badly."
-WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}  # worst first
 
 
 @command("align", "align photos/ --out aligned/")
@@ -52,10 +51,7 @@ def doctor(
     with progress_bar("examining") as report:
         result = examine(image_set.address, **image_set.how, seed=seed, progress=report)
     report_images(result.images, "unreadable:", "unreadable files (--json names all)")
-    for finding in sorted(result.findings, key=lambda one: list(WORDS).index(one.level)):
-        advice = f" {finding.advice}" if finding.advice else ""
-        output.result(f"{WORDS[finding.level]:>4}  {finding.name}: {finding.text}{advice}")
-    output.result(f"verdict: {result.verdict.text}")
+    output.result(result.describe())
     values = result.as_json()
     if out is not None:
         from derender.report.run import doctor_page

@@ -129,8 +129,8 @@ def test_unreadable_files_and_copies_to_the_pixel_are_counted():
     result = doctor(made.as_set(images, skipped=skipped, duplicates=copies))
     by_name = {finding.name: finding for finding in result.findings}
     assert result.identical == 2 and result.as_json()["near_copies"] == 0
-    assert by_name["files"].level == "trouble"
-    assert by_name["files"].text == "35 % of the files cannot be read."
+    assert by_name["files"].level == "trouble" and repr(result).endswith(result.verdict.text)
+    assert "   !  files: 35 % of the files cannot be read." in repr(result)
     assert "1 % of the images are copies or near copies (2 of 146: 2 to the pixel" in by_name["copies"].text
 
 

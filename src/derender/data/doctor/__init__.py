@@ -23,6 +23,7 @@ from derender.storage.bounded import table_beside
 
 Level = Literal["good", "note", "trouble", "objection", "open"]
 """``trouble``: will struggle; ``objection``: does not suit; ``open``: cannot be judged on this set."""
+WORDS = {"objection": "NO", "trouble": "!", "note": "note", "open": "?", "good": "ok"}  # worst first
 
 AXIS_OFFSET = 0.06  # an axis of symmetry farther from the middle than this share of the width is off it
 AXIS_SYMMETRIC = 0.7  # both sides about an axis correlate by this much where it is one
@@ -136,8 +137,7 @@ def findings_of(
     if "kinship" not in result:
         result["kinship"] = CheckFinding("kinds", "open", "No two groups are large enough to compare.")
     off = result["symmetry"].level != "good" and axis.correlation > AXIS_SYMMETRIC
-    name = "symmetry" if off else "fill"
-    one = result[name]
+    one = result[name := "symmetry" if off else "fill"]
     if abs(axis.offset) >= AXIS_OFFSET and (off or one.level == "good"):
         side = "right" if axis.offset > 0 else "left"
         where = f"Their axis of symmetry lies {percent(abs(axis.offset))} of the width {side} of the middle."
@@ -145,8 +145,7 @@ def findings_of(
         level, short = (one.level if off else "trouble"), "the axis of symmetry is off the middle"
         result[name] = replace(one, level=level, text=f"{one.text} {where}", advice=advice, short=short)
     if result["light"].level == "objection":  # where both are missing, nothing is left to learn a shape from
-        view = values["view"].value + 2 * values["view"].error
-        missing = view < (CHECKS["view"].struggles or 0)
+        missing = values["view"].value + 2 * values["view"].error < (CHECKS["view"].struggles or 0)
         name, level = ("view", "objection") if missing else ("light", "trouble")
         result[name] = replace(result[name], level=level)
     return tuple(result.values())
@@ -190,6 +189,14 @@ class Examination:
             return None
         return self.images.images[self.shared.rows].mean(axis=0, dtype=np.float64) / 255
 
+    def describe(self) -> str:
+        """What was found, worst first, one a line, and the verdict."""
+        ranked = sorted(self.findings, key=lambda one: list(WORDS).index(one.level))
+        lines = [f"{WORDS[one.level]:>4}  {one.name}: {one.text} {one.advice}".rstrip() for one in ranked]
+        return "\n".join([*lines, f"verdict: {self.verdict.text}"])
+
+    __repr__ = describe
+
     def as_json(self) -> dict[str, Any]:
         """What ``derender doctor --json`` writes."""
         files, shared = self.images.files, self.shared
@@ -205,8 +212,7 @@ class Examination:
             "distinct": len(files) - len(copies),
             "identical": self.identical,
             "near_copies": len(copies) - self.identical,
-            "clipped": self.values["clipped"].value,
-            "grey": self.values["grey"].value,
+            **{name: self.values[name].value for name in ("clipped", "grey")},
             "blank": round(self.values["blank"].value * len(files)),
             "originals": self.originals,
             "compared": 0 if shared is None else len(shared.rows),
@@ -275,8 +281,7 @@ def quick_verdict(images: ImageSet) -> str:
     findings = doctor(images.select(evenly_spaced(len(images), 400))).findings
     if len(images) > 400:  # a sample does not show how many there are
         findings = tuple(finding for finding in findings if finding.name != CHECKS["distinct"].name)
-    verdict = verdict_of(findings)
-    return "" if verdict.word == "suits" else verdict.text
+    return "" if (verdict := verdict_of(findings)).word == "suits" else verdict.text
 
 
 def _compare(images: ImageSet, rows: np.ndarray, generator: np.random.Generator) -> Shared | None:
@@ -309,8 +314,7 @@ def _compare(images: ImageSet, rows: np.ndarray, generator: np.random.Generator)
 def _examples(blank: np.ndarray, group: np.ndarray, shared: Shared | None) -> dict[str, tuple[int, ...]]:
     """Images for the page, by what they show; those of the extremes are extreme, no pick."""
     examples: dict[str, np.ndarray] = {}
-    copies = np.flatnonzero(group != np.arange(len(group)))
-    if len(copies):
+    if len(copies := np.flatnonzero(group != np.arange(len(group)))):
         some = copies[evenly_spaced(len(copies), SHOWN // 2)]
         examples["copies, in pairs"] = np.stack([group[some], some], axis=1).ravel()
     if blank.any():
