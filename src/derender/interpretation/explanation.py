@@ -64,6 +64,11 @@ class Explained:
         values |= {**self.shares.numbers(), "pair": None if self.pair is None else self.pair[1]}
         return Scores(shown, values, [*tables.share_verdicts(self.shares), *stuck, *self.left_out])
 
+    def __repr__(self) -> str:
+        return repr(self.scores)
+
+    _repr_markdown_ = __repr__
+
 
 def explain(
     images: ImageSet | str | Path,

@@ -8,12 +8,9 @@ by Lightning Fabric. Leaves out splitting a model over devices.
 
 import logging
 import os
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from inspect import signature
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -106,14 +103,9 @@ def started_together() -> int:
 
 def open_fabric(accelerator: str) -> Any:
     """A Lightning Fabric of one device; under torchrun of one for each process, joined when this returns."""
-    stub = ModuleType("torchmetrics")  # Fabric reads its version alone: two of the four seconds of its import
-    stub.__dict__["__version__"] = version("torchmetrics")
-    stands_in = sys.modules.setdefault("torchmetrics", stub) is stub
     from lightning_fabric import Fabric
     from lightning_fabric.strategies.ddp import DDPStrategy
 
-    if stands_in:
-        del sys.modules["torchmetrics"]
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its hints are not on this program
     world = started_together()
     if world == 1:
