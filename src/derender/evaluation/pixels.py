@@ -147,7 +147,7 @@ def masked_ssim(
     """
     if min(target.shape[-2:]) < WINDOW:
         return torch.full((len(target),), torch.nan, dtype=torch.float64)
-    hole = torch.nn.functional.pad((mask <= 0).float(), (WINDOW // 2,) * 4, value=1.0)
+    hole = torch.nn.functional.pad((~(mask > 0)).float(), (WINDOW // 2,) * 4, value=1.0)
     inside = torch.nn.functional.max_pool2d(hole[:, None], WINDOW, stride=1)[:, 0] == 0  # window centres
     results = []
     for shown, true, covered, centres in zip(prediction, target, mask > 0, inside, strict=True):
