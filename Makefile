@@ -19,7 +19,7 @@ setup: $(STAMP)  ## make .venv with the tested versions of everything
 demo: $(STAMP)  ## generate faces, train, score, write one report to ./derender-demo (minutes, offline)
 	@$(BIN)/derender demo $(ARGS)
 
-test: $(STAMP)  ## every test, ruff and pyright; ARGS="-k render" narrows it down
+test: $(STAMP)  ## every test, ruff and pyrefly; ARGS="-k render" narrows it down
 	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=2 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
 
 docs: $(STAMP)  ## build the site into build/docs, warnings as errors

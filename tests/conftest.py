@@ -11,7 +11,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
-LONGEST = ("test_pyright_finds_nothing", "test_readers_refuse_what_is_broken", "test_two_processes")
+LONGEST = ("test_readers_refuse_what_is_broken", "test_two_processes")
 LONGEST += ("test_what_fails_in_all_processes",)  # with the two processes of those before
 LONGEST += ("test_a_kill_at_any_step",)  # which forks: the sooner, the smaller a process is copied
 gc.disable()  # until all is imported, which then stays: no collection looks at it again

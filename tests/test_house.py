@@ -15,7 +15,7 @@ BUDGET = {  # lines, files
     "data": (6_480, 30),
     "evaluation": (6_893, 32),
     "report": (3_694, 21),
-    "cli": (2_077, 28),
+    "cli": (2_078, 28),
     "training": (3_435, 19),
     "baselines": (2_308, 11),
     "render": (1_658, 15),
@@ -31,7 +31,7 @@ BUDGET = {  # lines, files
     "renderers": (627, 8),
     "learn": (896, 5),
 }
-TOTAL = (36_993, 233)
+TOTAL = (36_994, 233)
 TEST_LINES = 25_881
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

@@ -6,7 +6,7 @@ ranges for cars. `small` has a quarter of the widths (a sixteenth of the work) a
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import Field
 
@@ -29,7 +29,7 @@ class ModelSettings(Settings):
 
     def grown(self, image_size: int) -> "ModelSettings":
         """The settings of such a model after growing to a larger image size."""
-        sizes = {"image_size": image_size, "grown_from": self.network.encoded_size}
+        sizes: dict[str, Any] = {"image_size": image_size, "grown_from": self.network.encoded_size}
         return self.model_copy(update={"network": NetworkSettings(**{**self.network.model_dump(), **sizes})})
 
     def description(self, factors: Sequence[str]) -> str:

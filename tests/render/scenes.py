@@ -33,7 +33,7 @@ def scene(
     shift = 0.02 * (uniform(count, 3) - 0.5)
     camera = torch.cat((turn_rad * 2 * (uniform(count, 3) - 0.5), shift), dim=1)
     values = (depth, uniform(count, 3, height, width), light, camera)
-    return tuple(value.to(dtype) for value in values)  # pyright: ignore[reportReturnType]
+    return tuple(value.to(dtype) for value in values)
 
 
 def camera(dtype: torch.dtype = torch.float64, **parts: float) -> Tensor:

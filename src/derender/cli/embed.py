@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from derender.baselines import BASELINES
 from derender.cli import options
@@ -53,10 +54,10 @@ def embed(
         raise ValueError("--fit-steps belongs to our models: leave it out with --baseline")
     if engine == "local" and workers is not None:
         raise ValueError("--workers belongs to --engine ray: leave it out, every core is used")
-    how = {"batch_size": batch_size, "engine": engine, "workers": workers, "fresh": output.force}
+    how: dict[str, Any] = {"batch_size": batch_size, "engine": engine, "workers": workers}
     with progress_bar("embedding") as report:
-        how |= {"device": device, "progress": report}
-        reading = {**images.how, "keep_duplicates": keep_duplicates}
+        how |= {"fresh": output.force, "device": device, "progress": report}
+        reading: dict[str, Any] = {**images.how, "keep_duplicates": keep_duplicates}
         if name is None:
             done = derender.embed_to_file(images.address, model, out, **reading, fit_steps=fit_steps, **how)
         else:

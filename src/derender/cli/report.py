@@ -1,7 +1,7 @@
 """`derender report`: the page of a run, made again with everything that is available."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,7 +31,7 @@ def report(
     output.check(out)
     evidence, data = Evidence(), images.optional_address
     if data is not None:
-        how = {"truth": truth, "labels": label or (), "device": device, **images.how}
+        how: dict[str, Any] = {"truth": truth, "labels": label or (), "device": device, **images.how}
         with progress_bar("gathering", "parts") as progress:
             evidence = run_evidence(run, data, progress=progress, **how)
     elif truth is not None or label:

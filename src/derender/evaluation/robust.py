@@ -122,7 +122,7 @@ def robustness(
     fit_on = trial.pictures.select(np.unique(np.concatenate([curve.learn for curve in trial.curves])))
     rows += feature_rows.control_rows(trial.pictures, first.settings, how, fit_on=fit_on)
     features, quiet = {row.name: row.arrays() for row in rows}, [row.name for row in rows if row.control]
-    same = {**how.scoring, "controls": quiet, "head": head, "progress": how.stage("probing", "probes")}
+    same: Any = {**how.scoring, "controls": quiet, "head": head, "progress": how.stage("probing", "probes")}
     result = compare_robustness(features, trial, how.seeds(seeds), **same)
     notes = [*how.notes, f"{len(trial.images):,} images: {trial.how}"]
     notes += [f"{curve.title}: {verdict(curve.rows[score][0], AREA, _AREA)}" for curve in result.curves]

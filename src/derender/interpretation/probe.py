@@ -156,7 +156,7 @@ class Probe:
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write weights and what they mean to ``folder``; complete or not at all."""
         facts = {"format": FORMAT, "kind": self.kind, "names": self.names, "head": self.head}
-        facts["sizes"] = list(self.sizes.items())
+        facts |= {"sizes": list(self.sizes.items())}
         with new_folder(folder, overwrite=overwrite, marker=CONFIG_FILE) as temporary:
             (temporary / WEIGHTS_FILE).write_bytes(save({"weight": self.weight, "bias": self.bias}))
             (temporary / CONFIG_FILE).write_text(json.dumps(facts, indent=1))

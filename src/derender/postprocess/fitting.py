@@ -120,7 +120,7 @@ def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor,
     exact = centred.double()  # float32 sums depend on where memory begins
     gram = (exact @ exact.T if wide else exact.T @ exact).cpu().numpy()
     result = eigh(gram, subset_by_index=[len(gram) - count, len(gram) - 1])
-    variances, vectors = (torch.from_numpy(part.copy()).flip(-1).to(exact) for part in result)
+    variances, vectors = (torch.tensor(part).flip(-1).to(exact) for part in result)
     directions = vectors.T @ exact if wide else vectors.T
     length = directions.norm(dim=1, keepdim=True)
     distinct = (variances > variances.max() * 1e-10)[:, None]

@@ -99,7 +99,7 @@ def fit_projection(
     within = within + max(shrinkage, _NEVER_SINGULAR) * floor * torch.eye(width).to(within)
     largest = [width - min(directions, size, width), width - 1]
     result = eigh(between.cpu().numpy(), within.cpu().numpy(), subset_by_index=largest)
-    ratios, kept = (torch.from_numpy(part.copy()).to(within).flip(-1) for part in result)
+    ratios, kept = (torch.tensor(part).to(within).flip(-1) for part in result)
     kept = kept * (2 / (1 + ratios)) ** (evenness / 2)  # 1 within and as much between are the 2
     positive = ratios.clamp(min=_TINY)
     kept = kept * (positive / (1 + positive)) ** power

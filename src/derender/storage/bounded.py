@@ -71,7 +71,7 @@ def parse_json(content: str | bytes, kind: Any) -> Any:
 
 def _require_small(text: str) -> None:
     """Raise ValueError where a YAML text has too many values or levels, as often as aliases repeat them."""
-    within = [(None, 0, 0)]  # of each list or mapping that is open: its anchor, values and levels so far
+    within: list[Any] = [(None, 0, 0)]  # of each open list or mapping: anchor, values and levels so far
     sizes: dict[str | None, tuple[int, int]] = {}  # values and levels by anchor
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.CollectionStartEvent):

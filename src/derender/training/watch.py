@@ -69,7 +69,7 @@ MEASURES = tuple(dict.fromkeys(sign.measure for sign in SIGNS))
 def largest_gradients(model: nn.Module) -> tuple[list[str], Float[Tensor, " n"]]:
     """Names of all gradients, and on the device the largest absolute value of each, NaN where one is."""
     result = {name: value.grad for name, value in model.named_parameters() if value.grad is not None}
-    sizes = torch._foreach_norm(list(result.values()), math.inf)  # pyright: ignore[reportPrivateImportUsage]
+    sizes = torch._foreach_norm(list(result.values()), math.inf)
     return [f"the gradient of {name}" for name in result], torch.stack([size.float() for size in sizes])
 
 

@@ -306,7 +306,7 @@ def split_in_two(
         fit, judged = order[::2], order[1::2]
         seed = int(generator.integers(2**31))
         space = PCA(min(_SPLIT_COMPONENTS, len(fit)), svd_solver="full").fit(rows[fit])
-        means = KMeans(2, init="random", n_init=_STARTS, random_state=seed)  # pyright: ignore[reportArgumentType]
+        means = KMeans(2, init="random", n_init=_STARTS, random_state=seed)
         first, second = means.fit(space.transform(rows[fit])).cluster_centers_
         place = space.transform(rows) @ (second - first) - (second @ second - first @ first) / 2
         groups = blind[judged][place[judged] <= 0], blind[judged][place[judged] > 0]

@@ -50,7 +50,7 @@ def load_utk(source: Source) -> Table | None:
     ages = [float(one["age"]) if one else np.nan for one in results]
     labels = {"age": np.array([age if age <= _UTK_OLDEST else np.nan for age in ages], np.float32)}
     for column, names in _UTK_CODES.items():
-        by_code = dict(zip("01234", names, strict=False))
+        by_code: dict[str, str] = dict(zip("01234", names, strict=False))
         labels[column] = text_column(by_code.get(one[column] or "", "") if one else "" for one in results)
     return Table(source.images, labels)
 

@@ -45,7 +45,7 @@ class BenchmarkPart:
     truth: bool = False
 
 
-KINDS = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSettings)}  # and its settings
+KINDS: dict[str, tuple] = {"faces": (faces.generate, FaceSettings), "cars": (cars.generate, CarSettings)}
 
 PARTS = {
     kind: {name: BenchmarkPart(**row) for name, row in numbers_of(kind)["benchmark"].items()}
