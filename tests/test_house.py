@@ -18,7 +18,7 @@ BUDGET = {  # lines, files
     "cli": (2_078, 28),
     "training": (3_435, 19),
     "baselines": (2_308, 11),
-    "render": (1_658, 15),
+    "render": (1_661, 15),
     "features": (1_246, 8),
     "interpretation": (1_023, 5),
     "photo": (1_556, 7),
@@ -31,7 +31,7 @@ BUDGET = {  # lines, files
     "renderers": (627, 8),
     "learn": (896, 5),
 }
-TOTAL = (36_994, 233)
+TOTAL = (36_997, 233)
 TEST_LINES = 25_881
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

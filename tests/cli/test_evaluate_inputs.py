@@ -19,7 +19,7 @@ def folder(tmp_path_factory) -> Path:
     made = tmp_path_factory.mktemp("inputs")
     net = Derenderer.from_preset("small", seed=0, image_size=32, width=4, light_width=4, code_size=8)
     with torch.no_grad():
-        next(net.nets["geometry"].parameters()).fill_(float("nan"))  # type: ignore[union-attr]
+        next(net.nets["geometry"].parameters()).fill_(float("nan"))
     net.save(made / "broken")
     write(faces.generate(4, 32, 0), made / "faces")
     values = np.random.default_rng(0).normal(size=(ROWS, 6))

@@ -48,7 +48,7 @@ class Looking:
     def __init__(self, where: str):
         net = nn.Module()
         net.encoder = QuadrantEncoder(where)
-        net.encode = net.encoder.forward  # type: ignore[assignment]
+        net.encode = net.encoder.forward
         self.nets, self.features = {"geometry": net}, Features()
 
     def factor_activations(self, name: str, images: torch.Tensor) -> torch.Tensor:

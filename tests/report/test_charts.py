@@ -19,7 +19,7 @@ EVIL = "<script>alert(1)</script>"
 
 
 def scores(*cells: float | None, best: str | None = "high") -> ScoreTable:
-    columns = (Column("rows", None, 0), Column("accuracy", best))  # type: ignore[arg-type]
+    columns = (Column("rows", None, 0), Column("accuracy", best))
     rows = [Row(f"model {place}{EVIL}", (10, cell)) for place, cell in enumerate(cells)]
     return ScoreTable("identity: 10 rows", "features", columns, [*rows, Row("chance", (10, 0.1), True)])
 

@@ -104,7 +104,7 @@ def broken_gradient(model: Derenderer) -> str | None:
 def what_is_said(model: Derenderer, images: Tensor, perceptual: nn.Module | None = None) -> str:
     """What the watcher of a training says of one step; it has to end the run."""
     objective = ObjectiveSettings(loocc="light+camera", perceptual="self" if perceptual else "none")
-    result = training_step(model, images, objective, perceptual, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+    result = training_step(model, images, objective, perceptual, torch.Generator().manual_seed(0))
     watch = Watcher(model.settings.ranges, 4)
     findings = seen(watch, result)
     assert watch.uneasy and findings and findings[0].fatal

@@ -186,5 +186,7 @@ def move_backward(by_points, depth, rotation, focal, grad_depth, grad_rotation, 
             total[k, 1] += by_ray_z * ray_y
             total[k, 2] += by_ray_z
             total[k, 3] += by_offset
-    grad_rotation[:] = total[:, :3]
-    grad_offset[:] = total[:, 3]
+    for k in range(3):  # one by one: for arrays Numba compiles a message about their shapes, for seconds
+        grad_offset[k] = total[k, 3]
+        for axis in range(3):
+            grad_rotation[k, axis] = total[k, axis]
