@@ -146,7 +146,7 @@ def require_agreement(what: str, pairs: Iterable[tuple[Any, Any]]) -> None:
 def _training() -> tuple[Any, Callable[[Any], None]]:
     """A small model, and a function that computes one training step on images without the update."""
     config = resolve("small", ["perceptual=none", "loocc=light+camera"])
-    model = Derenderer.seeded(config.model, 0).to(memory_format=torch.channels_last)  # pyrefly: ignore
+    model = Derenderer.seeded(config.model, 0).to(memory_format=torch.channels_last)
 
     def step(images: Tensor) -> None:
         noise = torch.Generator().manual_seed(0)

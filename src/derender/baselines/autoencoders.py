@@ -92,7 +92,7 @@ class BetaObjective(Settings):
 class BetaVaeConfig(AutoencoderConfig):
     """One training run of a beta-VAE."""
 
-    baseline: Literal["beta-vae"] = "beta-vae"  # pyrefly: ignore
+    baseline: Literal["beta-vae"] = "beta-vae"  # pyrefly: ignore[bad-override]
     objective: BetaObjective = BetaObjective()
 
 

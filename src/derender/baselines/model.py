@@ -190,8 +190,8 @@ class LoopModel(BaselineModel):
 class BaselineTask(loop.TrainingTask):
     """Train a baseline as its configuration says."""
 
-    config: Any  # pyrefly: ignore
-    outside_loss: tuple[str, ...]  # pyrefly: ignore
+    config: Any  # pyrefly: ignore[bad-override]
+    outside_loss: tuple[str, ...]  # pyrefly: ignore[bad-override]
 
     def build(self) -> LoopModel:
         """The untrained network; torch's global generator is left as it was."""

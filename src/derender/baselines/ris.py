@@ -83,7 +83,7 @@ class Ris(BaselineModel):
     def __init__(self, settings: RisSettings):
         super().__init__(settings)
         self.e4e = E4e(E4eSettings(**settings.model_dump(include=set(E4eSettings.model_fields))))
-        self.features = (*settings.parts, POSE)  # pyrefly: ignore
+        self.features = (*settings.parts, POSE)  # pyrefly: ignore[read-only]
         self.chosen = self.features
         widths = [layer.channels for layer in self.e4e.generator.layers]
         self.register_buffer("centres", torch.zeros(settings.clusters, widths[settings.cluster_layer]))

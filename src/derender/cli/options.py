@@ -72,7 +72,7 @@ def command(name: str, example: str, group: typer.Typer = app) -> Callable[[Call
             for key, type_, default in options:
                 if isinstance(default, Field):
                     if words := dict(default.metadata):
-                        type_ = Annotated[type_, typer.Option(*words.pop("names"), **words)]  # pyrefly: ignore
+                        type_ = Annotated[type_, typer.Option(*words.pop("names"), **words)]  # pyrefly: ignore[not-a-type]
                     default = Parameter.empty if default.default is MISSING else default.default
                 shown.append(Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=type_))
 
@@ -83,7 +83,7 @@ def command(name: str, example: str, group: typer.Typer = app) -> Callable[[Call
                 groups[word] = kind(**{one.name: given.pop(one.name) for one in fields(kind)})
             function(**given, **groups)
 
-        run.__signature__ = Signature(shown)  # pyrefly: ignore
+        run.__signature__ = Signature(shown)  # pyrefly: ignore[missing-attribute]
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
         return group.command(name, epilog=f"Example: derender {example}")(run)
 

@@ -33,7 +33,7 @@ class ListedStream(Stream):
     def __init__(self, files: Source, layout: Layout, table: Table, subset: str | None, half: str):
         self.files = files
         self.layout, self.terms, self.fit = layout.name, layout.terms, layout.fit
-        self.table: Table = table  # pyrefly: ignore
+        self.table: Table = table
         self.source = str(files.path) + ("" if half == "all" else f"?half={half}")
         self.source += "" if subset is None else f"::{subset}"
         self.passed_over = (*files.skipped, *table.skipped)

@@ -81,7 +81,7 @@ class ShardStream(Stream):
         try:
             with shard.open("rb") as raw, tarfile.open(fileobj=raw, mode="r:*") as tar:
                 while (member := tar.next()) is not None:
-                    tar.members = []  # pyrefly: ignore  (it would keep them all)
+                    tar.members = []  # pyrefly: ignore[missing-attribute]  (it would keep them all)
                     folder, slash, base = printable(member.name).rpartition("/")
                     if not member.isreg() or member.issparse() or is_hidden(base):
                         continue
@@ -341,7 +341,7 @@ def _read_path(path: str | None, place: str | Path) -> bytes:
         import fsspec
 
         with fsspec.open(path, "rb") as stream:
-            return stream.read()  # pyrefly: ignore
+            return stream.read()  # pyrefly: ignore[missing-attribute]
     if isinstance(place, Path):
         inside = place if place.is_dir() else place.parent
         file = inside / path

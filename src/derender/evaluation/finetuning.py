@@ -156,11 +156,11 @@ class FinetuneTask(TrainingTask):
     stays as it is (None: fresh weights).
     """
 
-    config: FinetuneConfig  # pyrefly: ignore
+    config: FinetuneConfig  # pyrefly: ignore[bad-override]
     images: UInt8[np.ndarray, "n 3 h w"]
     target: JointLabels
     start: Derenderer | None = None
-    outside_loss: tuple[str, ...] = RENDERING_TERMS  # pyrefly: ignore
+    outside_loss: tuple[str, ...] = RENDERING_TERMS  # pyrefly: ignore[bad-override]
 
     def build(self) -> FinetunedModel:
         """The model to start from with a fresh head, the same for the same seed."""

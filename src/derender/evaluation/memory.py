@@ -54,7 +54,7 @@ class Memory:
         arrays = make()
         if file is not None:
             with atomic_file(file) as temporary, temporary.open("wb") as stream:
-                np.savez(stream, **arrays, **{NAMES: np.array(list(arrays))})  # pyrefly: ignore
+                np.savez(stream, **arrays, **{NAMES: np.array(list(arrays))})  # pyrefly: ignore[bad-argument-type]
         self.made += 1
         return arrays
 
@@ -68,7 +68,7 @@ class Memory:
 
         An entry of a class whose fields have changed since is another result.
         """
-        names = [field.name for field in dataclasses.fields(kind)]  # pyrefly: ignore
+        names = [field.name for field in dataclasses.fields(kind)]  # pyrefly: ignore[bad-argument-type]
         return unpacked(kind, self.recall(what, {**inputs, "fields": names}, lambda: packed(make())))
 
     def summary(self, what: str = "results") -> str:
@@ -119,7 +119,7 @@ def unpacked(kind: type[T], arrays: Mapping[str, np.ndarray]) -> T:
     def whole(one: dict[str, Any]) -> Any:
         return arrays[one["array"]] if set(one) == {"array"} else one
 
-    holder: Any = tuple[kind]  # pyrefly: ignore
+    holder: Any = tuple[kind]
     adapter = TypeAdapter(holder, config=ConfigDict(arbitrary_types_allowed=True))
     return adapter.validate_python([json.loads(str(arrays["value"]), object_hook=whole)])[0]
 

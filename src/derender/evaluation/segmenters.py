@@ -204,7 +204,7 @@ class SegmentationNet(nn.Module):
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n outputs h w"]:
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            levels = zip(*(encoder.skips(images) for encoder in self.encoders), strict=True)  # pyrefly: ignore
+            levels = zip(*(encoder.skips(images) for encoder in self.encoders), strict=True)  # pyrefly: ignore[not-callable]
             joined = [torch.cat(level, dim=1) for level in levels]
         return self.decoder(joined)
 
@@ -238,7 +238,7 @@ def train_segmenter(
 
     The seed orders the images; ``progress`` is called with (images seen, loss) after every step.
     """
-    net.to(memory_format=torch.channels_last).train()  # pyrefly: ignore
+    net.to(memory_format=torch.channels_last).train()  # pyrefly: ignore[no-matching-overload]
     learning = [parameter for parameter in net.parameters() if parameter.requires_grad]
     optimiser = torch.optim.Adam(learning, lr=settings.learning_rate, betas=settings.betas, fused=True)
     generator, seen, means = torch.Generator().manual_seed(seed), 0, []

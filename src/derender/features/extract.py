@@ -23,7 +23,7 @@ def model_fingerprint(model: nn.Module) -> str:
     for name, value in sorted({**model.state_dict(), **dict(model.named_buffers())}.items()):
         array = value.detach().cpu().contiguous()
         digest.update(f"{name} {array.dtype} {tuple(array.shape)}".encode())
-        digest.update(array.reshape(-1).view(torch.uint8).numpy())  # pyrefly: ignore
+        digest.update(array.reshape(-1).view(torch.uint8).numpy())  # pyrefly: ignore[bad-argument-type]
     return digest.hexdigest()[:16]
 
 

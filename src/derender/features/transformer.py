@@ -74,7 +74,7 @@ class DisentangledFeatures(TransformerMixin, BaseEstimator):
         return True
 
     def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()  # pyrefly: ignore
+        tags = super().__sklearn_tags__()  # pyrefly: ignore[missing-attribute]
         tags.requires_fit = False
         tags.no_validation = True
         tags.input_tags.two_d_array = False

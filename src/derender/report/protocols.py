@@ -76,7 +76,7 @@ def write_curves(result: RobustnessComparison, score: str, file: Path) -> None:
         colours = cycle({"color": colour, "marker": "o", "markersize": 3} for colour in SERIES[:-1])
         for row in curve.rows[score]:
             style = next(dashes if row.control else colours)
-            axes.plot(curve.levels, curve.values(row), label=row.name, linewidth=1.6, **style)  # pyrefly: ignore
+            axes.plot(curve.levels, curve.values(row), label=row.name, linewidth=1.6, **style)  # pyrefly: ignore[bad-argument-type]
         first = next((row for row in curve.rows[score] if not row.control), None)
         if first is not None:
             ends = [first.scores[level_name(level)] for level in curve.levels]

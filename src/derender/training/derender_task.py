@@ -68,11 +68,11 @@ def train(
 class DerenderTask(TrainingTask):
     """Train a `Derenderer`, its features kept; ``begins`` is false where a checkpoint gives the weights."""
 
-    config: TrainConfig  # pyrefly: ignore
+    config: TrainConfig  # pyrefly: ignore[bad-override]
     begins: bool = True
     ranks: Ranks = ALONE
     whitening: Whitening | None = None
-    outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION  # pyrefly: ignore
+    outside_loss: tuple[str, ...] = NOT_RECONSTRUCTION  # pyrefly: ignore[bad-override]
     replayable: ClassVar[bool] = True
 
     def shared(self, ranks: Ranks) -> "DerenderTask":
@@ -164,5 +164,5 @@ def perceptual_of(
         if objective.perceptual_rescaled:
             features.calibrate_(images[:CALIBRATION_IMAGES].float() / 255)
     if config.channels_last:
-        features = features.to(memory_format=torch.channels_last)  # pyrefly: ignore
+        features = features.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
     return features

@@ -66,7 +66,7 @@ class _Run:
         self.reader, self.train_rows = Reader(batches, ranks), torch.from_numpy(split.train)
         self.model: Any = task.build().to(fabric.device)
         if config.channels_last:
-            self.model.to(memory_format=torch.channels_last)  # pyrefly: ignore
+            self.model.to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
         self.folder = run_folder.RunFolder(out)
         if ranks.first and resume:
             run_folder.reopen_run(out, config, run_folder.describe_data(images, split))
@@ -213,7 +213,7 @@ class _Run:
         self.fabric.backward(result.total)
         gradients, largest = largest_gradients(self.model)
         self.broken.copy_(torch.maximum(self.broken, 1 - largest.isfinite().all().float()))
-        self.optimiser.found_inf = self.broken  # pyrefly: ignore
+        self.optimiser.found_inf = self.broken  # pyrefly: ignore[missing-attribute]
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         stages, note = ([], largest[:0]) if self.watcher is None else self.watcher.note(result)

@@ -140,7 +140,7 @@ def read_settings(
 class MetricsRow(TypedDict):
     """A line of metrics.jsonl; numbers, which may be NaN, and words by further names."""
 
-    __pydantic_config__ = ConfigDict(extra="allow")  # pyrefly: ignore
+    __pydantic_config__ = ConfigDict(extra="allow")  # pyrefly: ignore[bad-class-definition]
     kind: NotRequired[str]
     images: Annotated[int, Field(ge=0)]
     seconds: NotRequired[FiniteFloat]

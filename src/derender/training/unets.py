@@ -112,7 +112,7 @@ def _learn(
     assert joint is not None
     alone = nn.ModuleList([*encoders.values(), heads])
     learning = nn.ModuleList([alone, joint])
-    learning.requires_grad_(True).train().to(memory_format=torch.channels_last)  # pyrefly: ignore
+    learning.requires_grad_(True).train().to(memory_format=torch.channels_last)  # pyrefly: ignore[no-matching-overload]
     rate, decay = settings.learning_rate, settings.weight_decay
     optimiser = torch.optim.AdamW(learning.parameters(), rate, weight_decay=decay)
     with torch.no_grad():

@@ -42,7 +42,7 @@ def forward(
     focal = float64(focal_bits).to(depth.dtype.element_ty)
     facing, _, _, _, _, _, _, _, _, _ = cosine(depth, lamp, n, pixel, live, focal, height, width)
     shading = tl.load(lamp + n * 5) + tl.load(lamp + n * 5 + 1) * tl.maximum(facing, 0.0)
-    for channel in tl.static_range(CHANNELS):  # pyrefly: ignore
+    for channel in tl.static_range(CHANNELS):
         place = (n * CHANNELS + channel) * height * width + pixel
         tl.store(image + place, tl.load(albedo + place, mask=live, other=0) * shading, mask=live)
 
@@ -60,7 +60,7 @@ def backward(
     diffuse, lit = tl.load(lamp + n * 5 + 1), tl.maximum(facing, 0.0)
     shading = tl.load(lamp + n * 5) + diffuse * lit
     by_shading = facing * 0
-    for channel in tl.static_range(CHANNELS):  # pyrefly: ignore
+    for channel in tl.static_range(CHANNELS):
         place = (n * CHANNELS + channel) * height * width + pixel
         gradient = tl.load(grad + place, mask=live, other=0)
         by_shading += gradient * tl.load(albedo + place, mask=live, other=0)

@@ -92,7 +92,7 @@ def show(
     u = tl.where(seen, b0 * j0 + b1 * j1 + b2 * j2, 0.0).to(kind)
     v = tl.where(seen, b0 * i0 + b1 * i1 + b2 * i2, 0.0).to(kind)
     i, j, across, down = cell(u, v, height, width)
-    for channel in tl.static_range(CHANNELS):  # pyrefly: ignore
+    for channel in tl.static_range(CHANNELS):
         plane = (n * CHANNELS + channel) * height * width
         value, _, _ = look_up(image, plane + i * width + j, across, down, width, seen)
         tl.store(colour + plane + pixel, tl.where(seen, value, 0.0), mask=live)
@@ -130,7 +130,7 @@ def show_backward(
     gu, gv = across * 0, down * 0
     most = magnitude(gu, seen)
     image_unit, depth_unit = tl.load(units + n * 2), tl.load(units + n * 2 + 1)
-    for channel in tl.static_range(CHANNELS):  # pyrefly: ignore
+    for channel in tl.static_range(CHANNELS):
         plane = (n * CHANNELS + channel) * height * width
         gradient = tl.load(grad_colour + plane + pixel, mask=seen, other=0)
         at = plane + i * width + j

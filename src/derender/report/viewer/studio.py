@@ -277,7 +277,7 @@ class Studio:
     def neighbours(self, question: questions.NeighbourRequest) -> list[tuple[int, float]]:
         """Rows nearest by one factor of the image that gives it, and distances; without that image itself."""
         table = self.searched().table
-        other = dict(question.swaps).get(question.factor, question.picture)  # pyrefly: ignore
+        other = dict(question.swaps).get(question.factor, question.picture)  # pyrefly: ignore[no-matching-overload]
         features = self.shelf.get(other).features
         feature, itself = named(features, question.factor, "factor"), same_image(table, features).tolist()
         rows, away = nearest(table, feature, question.factor, question.k, exclude=itself)
