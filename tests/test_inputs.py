@@ -1,8 +1,5 @@
 """Arguments of library calls: values pass through, names and addresses are resolved, mistakes are errors."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -77,20 +74,3 @@ def test_optimisation_per_image_needs_its_maps(model):
     assert as_model(model, fit_steps=0).fitting is None
     with pytest.raises(ValueError, match="fit_steps must be 0 or more, got -1"):
         as_model("faces-64", fit_steps=-1)
-
-
-WRONG = """
-import derender, numpy
-for call in (derender.embed, derender.photo.find_faces):
-    try:
-        call(numpy.zeros((8, 8, 3)))
-    except (TypeError, ValueError) as error:
-        print(error)
-"""
-
-
-def test_arrays_in_the_wrong_place_are_named_where_types_are_not_checked():
-    answer = subprocess.run([sys.executable, "-c", WRONG], capture_output=True, text=True, check=True)
-    embed, find_faces = answer.stdout.splitlines()
-    assert "expected a folder, zip, shards or Hugging Face id, got ndarray" in embed
-    assert "expected bytes (H, W, 3), got float64" in find_faces

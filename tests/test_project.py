@@ -122,7 +122,8 @@ def test_import_takes_less_than_a_second_and_a_half_and_loads_no_heavy_package()
     assert not {name.split(".")[0] for name in loaded} & HEAVY
 
 
-def test_import_touches_no_network_and_writes_nothing(tmp_path):
+def test_import_touches_no_network_writes_nothing_and_arrays_in_the_wrong_place_are_named(tmp_path):
+    """In a process of its own, where types are not checked."""
     names = sorted(name for name in modules() if not name.endswith("__main__"))
     code = f"""
 import importlib, os, socket, sys
@@ -133,8 +134,16 @@ os.chdir({str(tmp_path)!r})
 for name in {names!r}:
     importlib.import_module(name)
 print("imported", len(sys.modules))
+for call in (sys.modules["derender"].embed, sys.modules["derender"].photo.find_faces):
+    try:
+        call(sys.modules["numpy"].zeros((8, 8, 3)))
+    except (TypeError, ValueError) as error:
+        print(error)
 """
-    assert run_python(code).startswith("imported")
+    imported, embed, find_faces = run_python(code).splitlines()
+    assert imported.startswith("imported")
+    assert "expected a folder, zip, shards or Hugging Face id, got ndarray" in embed
+    assert "expected bytes (H, W, 3), got float64" in find_faces
     assert not list(tmp_path.iterdir())
 
 

@@ -1,5 +1,7 @@
 """`derender whiten`, `refine` and `unet`: copies of a model, their measurements and refusals."""
 
+import json
+
 import pytest
 import torch
 from tests.cli.conftest import face_files, settings
@@ -11,7 +13,7 @@ from derender.storage.places import model_folder
 from derender.training.held_out_errors import read_errors
 
 KNOWN = "rendered-faces-64"
-FEW = ("pictures=8", "views=1", "spatial=false", "directions=8", "examples=12")
+FEW = ("pictures=8", "views=2", "spatial=false", "directions=8", "examples=12")
 SHORT = ("images=16", "batch_size=8", "fitted=8", "fit_steps=1", "whitening.pictures=8", "views=1")
 
 
@@ -28,20 +30,20 @@ def run(command, folder, out, *pairs, words=(), model=KNOWN) -> int:
 def fits(folder, tmp_path_factory):
     """A model that can fit scenes within 10 coordinates, and does so only on request."""
     made = tmp_path_factory.mktemp("models") / "fits"
-    assert run("whiten", folder, made, *FEW, "coordinates=10", words=("--limit", "24")) == 0
+    words = ("--limit", "24", "--json", made.with_suffix(".json"))
+    assert run("whiten", folder, made, *FEW, "coordinates=10", words=words) == 0
     assert not derender.load(made).features.fits_scenes
     return made
 
 
-def test_a_whitened_copy_has_other_features_and_the_same_scenes(folder, tmp_path, numbers):
-    few = settings("views=2", "directions=8", "spatial=false")
-    told, _ = numbers("whiten", folder, "-m", KNOWN, "-o", tmp_path / "mine", *few, "--limit", "24")
+def test_a_whitened_copy_has_other_features_and_the_same_scenes(fits):
+    told = json.loads(fits.with_suffix(".json").read_text())
     assert told["pictures"] == 24 and len(told["between_over_within"]["geometry"]) == 8
-    one, two = derender.load(KNOWN), derender.load(tmp_path / "mine")
+    one, two = derender.load(KNOWN), derender.load(fits)
     assert torch.linalg.matrix_rank(two.whitening.get_buffer("albedo_map"), rtol=1e-3) == 8
     image = torch.rand(1, 3, 64, 64)
     assert torch.equal(one.decompose(image).depth, two.decompose(image).depth)
-    assert read_errors(tmp_path / "mine") == read_errors(model_folder(KNOWN)) is not None
+    assert read_errors(fits) == read_errors(model_folder(KNOWN)) is not None
     assert not torch.equal(one.embed(image)["albedo"], two.embed(image)["albedo"])
 
 
@@ -94,9 +96,10 @@ def test_a_model_that_cannot_fit_is_told_how_to(folder, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["plain"]
 
 
-def test_a_refined_copy_comes_with_its_measurements(folder, tmp_path, numbers):
+def test_a_refined_copy_comes_with_its_measurements(folder, tiny, tmp_path, numbers):
+    assert run("whiten", folder, tmp_path / "fits", *FEW, words=("--limit", "24"), model=tiny) == 0
     short = settings(*SHORT, "spatial=false", "directions=8", "examples=16", "steps=2", "fit_steps=10")
-    told, shown = numbers("refine", folder, "-m", KNOWN, "-o", tmp_path / "mine", *short)
+    told, shown = numbers("refine", folder, "-m", tmp_path / "fits", "-o", tmp_path / "mine", *short)
     assert told["pictures"] == 180 and told["held_out"] == 20
     assert told["errors"]["before"] > told["errors"]["fitted"] > 0
     assert "20 held-out images: reconstructed with an error of" in shown

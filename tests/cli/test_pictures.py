@@ -19,6 +19,7 @@ from tests.cli.conftest import noise, run
 from derender import Derenderer
 from derender.report.edits import Edit
 from derender.report.options import ImageOptions
+from derender.report.viewer.images import rendered_examples
 from derender.storage.places import ERRORS_FILE
 from derender.training.held_out_errors import HeldOutErrors, write_errors
 from derender.training.process import LOCK_FILE
@@ -64,9 +65,10 @@ def test_relight_sweeps_and_says_which_light(tiny, photos, tmp_path, numbers):
     assert told["sheets"] == [str(out / "sheet.png")]
 
 
-def test_photographs_are_decomposed_by_faces_64_unless_a_model_is_named(photos, tmp_path):
+def test_photographs_are_decomposed_by_faces_64_unless_a_model_is_named(tmp_path):
+    Image.fromarray(rendered_examples("faces-64", 64)[0].picture).save(tmp_path / "0.png")
     for name, words in (("default", ()), ("named", ("-m", "faces-64"))):
-        assert run("decompose", photos / "0.png", "-o", tmp_path / name, *words) == 0
+        assert run("decompose", tmp_path / "0.png", "-o", tmp_path / name, *words) == 0
     with np.load(tmp_path / "default/0/scene.npz") as one, np.load(tmp_path / "named/0/scene.npz") as other:
         assert one["depth"].shape[-1] == 64
         np.testing.assert_array_equal(one["depth"], other["depth"])

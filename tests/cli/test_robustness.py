@@ -9,6 +9,7 @@ from PIL import Image
 from derender.data.synthetic import FaceSettings, faces, write
 
 QUICK = ["--resamples", 20, "--untrained-seeds", 1, "--seeds", 2, "--angles", "0,40", "--cache"]
+KNN = ["--head", "k-NN"]
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +43,11 @@ def test_generated_faces_by_angle_and_light(tiny, tmp_path, numbers):
 
 def test_pictures_rendered_again_and_pictures_of_known_angles(tiny, rendered, tmp_path, numbers):
     words = ["evaluate", "robustness", "-m", tiny, "--axes", "light", *QUICK, "none", "-d", rendered]
-    told, _ = numbers(*words, "--label", "expression", "--min-count", 4, "--groups", "identity")
+    told, _ = numbers(*words, "--label", "expression", "--min-count", 4, "--groups", "identity", *KNN)
     assert told["pictures"] == "render" and told["how"].endswith("re-rendered")
     tested = told["curves"]["light"]["n_tested"]
     assert tested[0] == tested[1] and tested[2] == 2 * tested[0]
-    told, _ = numbers(*words, "--pictures", "truth", "--out", tmp_path / "curves.svg")
+    told, _ = numbers(*words, *KNN, "--pictures", "truth", "--out", tmp_path / "curves.svg")
     light = told["curves"]["light"]
     assert told["kind"] == "classes" and len(light["levels_deg"]) == 4
     assert light["levels_deg"] == sorted(light["levels_deg"]) and light["n_tested"][0] == light["n_tested"][1]
@@ -58,7 +59,7 @@ def test_tracks_in_light_beyond_training(tiny, tmp_path, numbers):
     settings = FaceSettings(tracks=8, frames=2)
     write(faces.generate(32, 32, 0, settings), folder)
     words = ["evaluate", "robustness", "-m", tiny, "-d", folder, "--pictures", "truth", "--axes", "yaw"]
-    told, _ = numbers(*words, *QUICK, "none")
+    told, _ = numbers(*words, *KNN, *QUICK, "none")
     assert told["curves"]["yaw"]["n_tested"] == [4, 4, 6, 6, 4] and told["names"] == ["identity"]
 
 

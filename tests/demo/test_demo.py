@@ -105,7 +105,8 @@ def test_sentences_follow_the_numbers(told):
         assert ("Not ahead of every control: depth" in html) == (scores is worse)
 
 
-def test_a_folder_of_ones_own_opens_with_photographs_and_ends_with_its_run(tmp_path):
+def test_a_folder_of_ones_own_opens_with_photographs_and_ends_with_its_run(tmp_path, monkeypatch):
+    monkeypatch.setattr("derender.demo.story.SHOWN", 2)
     photos, pages = face_files(tmp_path / "photos", 24, seed=5), []
     page = run_own_demo(photos, tmp_path / "out", TINY, opened=lambda page: pages.append(page.read_text()))
     assert 'http-equiv="refresh"' in pages[0] and "lit from the left" in pages[0]

@@ -67,11 +67,11 @@ def test_every_face_lies_where_the_model_has_it(aligned):
 
 
 def test_heads_of_either_family_keep_nearly_their_training_frame():
-    made = faces.generate(5, 256, seed=3, settings=FaceSettings(pictures_per_identity=1)).images
-    for images in (made.transpose(0, 2, 3, 1), [np.asarray(head(number, 256)) for number in range(5)]):
+    made = faces.generate(5, 160, seed=3, settings=FaceSettings(pictures_per_identity=1)).images
+    for images in (made.transpose(0, 2, 3, 1), [np.asarray(head(number, 160)) for number in range(5)]):
         template = TEMPLATES["rendered-faces-64"]
         results = [frame_of(face, template) for one in images for face in find_faces(one)]
-        assert len(results) >= 4 and abs(np.median([one.side for one in results]) / 256 - 1) < 0.08
+        assert len(results) >= 4 and abs(np.median([one.side for one in results]) / 160 - 1) < 0.08
 
 
 def test_the_transform_leads_back_into_the_photograph(aligned, photos):
@@ -197,8 +197,8 @@ def test_the_turn_of_a_head_is_told(yaw):
     """Of heads that are found, within 15 degrees."""
     view = {"yaw_deg": (yaw, yaw), "yaw_sd_deg": None}
     settings = FaceSettings.model_validate({"view": view, "pictures_per_identity": 1})
-    heads = (head.transpose(1, 2, 0) for head in faces.generate(3, 256, 5, settings).images)
-    places = [find_faces(np.pad(head, ((70, 70), (70, 70), (0, 0)), mode="edge")) for head in heads]
+    heads = (head.transpose(1, 2, 0) for head in faces.generate(3, 160, 5, settings).images)
+    places = [find_faces(np.pad(head, ((44, 44), (44, 44), (0, 0)), mode="edge")) for head in heads]
     turns = [face.yaw_deg for place in places for face in place]
     assert len(turns) >= 2 and np.abs(np.subtract(turns, yaw)).max() < 15
 

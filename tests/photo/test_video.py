@@ -58,7 +58,7 @@ def test_the_unchanged_scene_gives_the_film_back_with_its_sound(film, tmp_path):
     assert jumps[0] < 0.5 * raw
 
 
-def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd, monkeypatch):
+def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd, monkeypatch, tiny):
     monkeypatch.setattr("derender.cli.console.PLAIN_LINE_EVERY_SECONDS", 3600)
     words = ["relight", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "out"), "--hold"]
     assert main(words) == 0
@@ -69,16 +69,16 @@ def test_a_film_is_relit_where_its_face_is(film, tmp_path, capfd, monkeypatch):
     (tmp_path / "none.png").write_bytes(b"no image")
     write_video(tmp_path / "short.mp4", iter(read(film)[:2]), (120, 90), 10.0)
     named = [str(tmp_path / name) for name in ("short.mp4", "none.mp4", "none.png")]
-    words = [*words[:3], *named, "-o", str(tmp_path / "two"), "--fit-steps", "0"]
+    words = ["relight", "-m", str(tiny), *named, "-o", str(tmp_path / "two"), "--fit-steps", "0"]
     assert main(words) == 2  # the others are edited
     assert capfd.readouterr().err.count("\n") == 2, "a line each, and none of OpenCV's"
     assert [folder.name for folder in (tmp_path / "two").iterdir()] == ["short"]
-    assert main(["mesh", "-m", "rendered-faces-64", str(film), "-o", str(tmp_path / "mesh")]) == 2
+    assert main(["mesh", "-m", str(tiny), str(film), "-o", str(tmp_path / "mesh")]) == 2
     assert "is a video" in capfd.readouterr().err
     for option in ("--only-frame", "--size=64", "--detail=model"):
         assert main([*words[:3], str(film), "-o", str(tmp_path / "whole"), option]) == 2
         assert "is a video, which is drawn whole" in capfd.readouterr().err
     with pytest.raises(ValueError, match="cannot be read as a video"):
-        edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict)
+        edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load(tiny), dict)
     with pytest.raises(ValueError, match="unknown frame of a video 'auto': choose face or none"):
-        edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load("faces-64"), dict, frame="auto")
+        edit_video(tmp_path / "none.mp4", tmp_path / "x.mp4", derender.load(tiny), dict, frame="auto")

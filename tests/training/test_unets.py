@@ -102,7 +102,7 @@ def test_the_decoder_is_saved_with_the_copy(distilled, images, tmp_path):
 def test_it_learns_what_the_model_predicts():
     model = derender.load("rendered-faces-64")
     images = torch.from_numpy(faces.generate(16, image_size=64, seed=9).images)
-    settings = unets.UNetSettings(images=480, batch_size=8, unet_width=4, learning_rate=5e-3)
+    settings = unets.UNetSettings(images=320, batch_size=8, unet_width=4, learning_rate=5e-3)
     distilled = unets.distil_unets(model, images, settings)
     hardly = unets.distil_unets(model, images, settings.model_copy(update={"images": 16}))
     assert distilled.errors["place"] < 0.75 * hardly.errors["place"]
@@ -113,7 +113,7 @@ def test_it_learns_what_the_model_predicts():
     maps = torch.cat([*target.maps.values()], dim=1)
     jointly = (joint_maps(one.model, images) for one in (distilled, hardly))
     ours, none = (masked_l1(one, maps, target.mask) for one in jointly)
-    assert ours < 0.85 * none, "the decoder over both learns it, too"
+    assert ours < 0.9 * none, "the decoder over both learns it, too"
     theirs, ours, none = (one.encode(pictures)["albedo"] for one in (model, distilled.model, hardly.model))
     assert (ours - theirs).square().mean() < 0.97 * (none - theirs).square().mean()
     before = distilled.errors["reconstruction before"]

@@ -13,7 +13,7 @@ from derender.data.synthetic import faces
 from derender.model import Derenderer
 from derender.scene import Scene
 from derender.scene.ranges import SceneRanges
-from derender.training import resolve, train
+from derender.training import loop, resolve, train
 from derender.training import watch as watching
 from derender.training.run_folder import read_metrics
 from derender.training.watch import SIGNS, Finding, Watcher
@@ -159,16 +159,17 @@ def test_a_memory_that_no_watcher_gave_is_refused(memory):
 COLLAPSING = ["image_size=32", "width=4", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]
 COLLAPSING += ["curvature_weight=0", "learning_rate=1e-2", "weight_decay=0", "warmup_images=0"]
 COLLAPSING += ["final_rate=1", "whitening.pictures=0", "fitting.examples=0"]
-SOONER = 8
+SOONER = 16
 """By how much the clock of the watcher is faster in a real collapse."""
 
 
-def generated(count: int) -> ImageSet:
-    pixels = faces.generate(count, image_size=32, seed=0).images
-    return ImageSet(images=pixels, files=tuple(f"{i:04d}.png" for i in range(count)))
+@pytest.fixture(scope="module")
+def generated() -> ImageSet:
+    pixels = faces.generate(40, image_size=32, seed=0).images
+    return ImageSet(images=pixels, files=tuple(f"{i:04d}.png" for i in range(40)))
 
 
-def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypatch):
+def test_a_real_collapse_is_caught_while_its_loss_still_falls(generated, tmp_path, monkeypatch):
     for name in ("PERSISTENCE_IMAGES", "MEMORY_IMAGES"):
         monkeypatch.setattr(watching, name, getattr(watching, name) / SOONER)
     signs = [
@@ -176,7 +177,8 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypa
         for sign in SIGNS
     ]
     monkeypatch.setattr(watching, "SIGNS", tuple(signs))
-    result = train(resolve("small", COLLAPSING), generated(60), tmp_path / "run")
+    monkeypatch.setattr(loop, "LOG_EVERY_STEPS", 8)
+    result = train(resolve("small", COLLAPSING), generated, tmp_path / "run")
     assert result.stopped == "collapse" and result.images < 4_000
     results = {finding.sign for finding in result.findings if finding.fatal}
     assert results & {"saturated depth", "torn depth", "view at its bound"}
@@ -186,7 +188,7 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(tmp_path, monkeypa
     assert results <= set(rows[-1])
 
 
-def test_the_last_good_state_is_kept_whatever_the_interval(tmp_path, monkeypatch):
+def test_the_last_good_state_is_kept_whatever_the_interval(generated, tmp_path, monkeypatch):
     """With the intervals of the preset, and a sign that is on from image 400 on."""
     judge = Watcher.judge
 
@@ -197,7 +199,7 @@ def test_the_last_good_state_is_kept_whatever_the_interval(tmp_path, monkeypatch
 
     monkeypatch.setattr(Watcher, "judge", ill)
     run = tmp_path / "run"
-    result = train(resolve("small", [*COLLAPSING, "learning_rate=1e-4", "batch_size=32"]), generated(60), run)
+    result = train(resolve("small", [*COLLAPSING, "learning_rate=1e-4", "batch_size=32"]), generated, run)
     assert (result.stopped, result.images) == ("collapse", 704)
     assert [row["images"] for row in read_metrics(run) if row["kind"] == "validation"] == [320]
     assert json.loads((run / "checkpoints/last/state.json").read_text())["state"]["images"] == 320

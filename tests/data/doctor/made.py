@@ -13,7 +13,7 @@ SIDE = 64
 FLAT = LightSettings(yaw_deg=(15.0, 15.0), pitch_deg=(10.0, 10.0), ambient=(0.5, 0.5), diffuse=(0.5, 0.5))
 STILL = ViewSettings(yaw_deg=(0.0, 0.0), pitch_deg=(0.0, 0.0), roll_deg=(0.0, 0.0), shift=(0.0, 0.0))
 SIDEWAYS = ViewSettings(yaw_deg=(30.0, 40.0), yaw_sd_deg=None)
-COUNT = 144
+COUNT = 108
 
 
 @cache
@@ -22,7 +22,7 @@ def generated(kind: str, count: int = COUNT) -> np.ndarray:
     kinds = {"faces": {}, "one view": {"view": STILL}, "one light": {"light": FLAT}}
     kinds |= {"one view and light": {"view": STILL, "light": FLAT}, "from one side": {"view": SIDEWAYS}}
     settings = kinds[kind]
-    each = 1 if kind == "faces" else 3  # images of a person
+    each = 1 if kind == "faces" else 6  # images of a person, whose shape is made once
     made = faces.generate(count, SIDE, 11, FaceSettings(pictures_per_identity=each, **settings))
     made.images.setflags(write=False)
     return made.images

@@ -51,7 +51,7 @@ def test_about_says_what_there_is_and_a_picture_is_taken_apart_and_shown(client)
 def test_a_fitted_scene_is_nearer_to_the_picture():
     model, face = load("rendered-faces-64"), faces.generate(1, 64, seed=7).images[0]
     held_out = read_errors(model_folder("rendered-faces-64"))
-    studios = (Studio(model, "faces", held_out=held_out, fit_steps=steps) for steps in (0, 20))
+    studios = (Studio(model, "faces", held_out=held_out, fit_steps=steps) for steps in (0, 10))
     read, fitted = (studio.open(face.transpose(1, 2, 0)) for studio in studios)
     assert fitted["l1_feed_forward"] == pytest.approx(read["l1"])
     assert fitted["l1"] < 0.9 * read["l1"]

@@ -26,7 +26,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 CHROMIUM = os.environ.get("DERENDER_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium here (DERENDER_CHROMIUM names one)")
 PATIENCE_MS = 60_000
-SIZES = ("DRAFT = 256, SETTLED = 512, TEXTURE = 1024", "DRAFT = 64, SETTLED = 96, TEXTURE = 192")
+SIZES = ("DRAFT = 256, SETTLED = 512, TEXTURE = 1024", "DRAFT = 64, SETTLED = 80, TEXTURE = 96")
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +37,14 @@ def rendered() -> np.ndarray:
 @pytest.fixture(scope="module")
 def address(rendered) -> Iterator[str]:
     model = load("rendered-faces-64")
-    model = model.with_features(model.features.with_steps(2))
-    made = {"fit_steps": 2}
+    model = model.with_features(model.features.with_steps(0))
+    made = {"fit_steps": 0}
     table = FeatureTable(("a<b>.png", "b.png", "c.png"), embed_images(model, rendered), {}, made)
     examples = [Example(f"<i>face</i> {at}", one.transpose(1, 2, 0)) for at, one in enumerate(rendered)]
     studio = Studio(model, "rendered-faces-64", Shelf(3), examples, Gallery(table))
-    with serving(Application(studio)) as url:
+    with serving(Application(studio)) as url, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("derender.report.viewer.studio.FILM_FRAMES", 3)
+        patch.setattr("derender.report.viewer.studio.SURFACE_SIZE", 64)
         yield url
 
 
@@ -57,7 +59,7 @@ def browser():
 
 def begun(browser, **context: object):
     """An empty page, patient with slow machines."""
-    shown = browser.new_context(**context).new_page()
+    shown = browser.new_context(reduced_motion="reduce", **context).new_page()
     shown.set_default_timeout(PATIENCE_MS)
     return shown
 
@@ -68,20 +70,27 @@ def smaller(route) -> None:
     route.fulfill(response=script, body=script.text().replace(*SIZES))
 
 
-@pytest.fixture
-def page(browser, address):
-    """The page, opened; at the end it must have asked nobody else and complained of nothing."""
-    shown = begun(browser, viewport={"width": 1200, "height": 900})
+@pytest.fixture(scope="module")
+def empty(browser):
+    """A page that will have smaller images; what it has asked for, and complained of."""
+    shown, asked, wrong = begun(browser, viewport={"width": 800, "height": 600}), [], []
     shown.route("**/view.js", smaller)
-    asked, wrong = [], []
     shown.on("request", lambda request: asked.append(request.url))
     shown.on("pageerror", lambda error: wrong.append(str(error)))
     refusal = "Failed to load resource"  # which the page puts into words
     shown.on("console", lambda m: m.type == "error" and refusal not in m.text and wrong.append(m.text))
+    yield shown, asked, wrong
+    shown.context.close()
+
+
+@pytest.fixture
+def page(empty, address):
+    """The page, opened; at the end it must have asked nobody else and complained of nothing."""
+    shown, asked, wrong = empty
+    asked.clear()
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
     yield shown
-    shown.context.close()
     assert not wrong
     assert all(url.startswith((address, "data:", f"blob:{address}")) for url in asked)
 
@@ -242,15 +251,14 @@ def test_a_crop_is_moved_a_new_picture_resets_swaps_and_what_is_wrong_is_said(pa
     assert "no longer stored" not in page.inner_text("#status")
 
 
-def test_effects_of_a_renderer_have_sliders(browser, rendered):
+def test_effects_of_a_renderer_have_sliders(empty, rendered):
     plain = load("rendered-faces-64")
     settings = plain.settings.model_copy(update={"renderer": "phong+lambert-shadow+haze"})
     model = Derenderer.seeded(settings, 0)
     model.load_state_dict(model.state_dict() | plain.state_dict())
     examples = [Example("face", rendered[0].transpose(1, 2, 0))]
     with serving(Application(Studio(model.eval(), "glossy", Shelf(3), examples))) as url:
-        shown = begun(browser)
-        shown.route("**/view.js", smaller)
+        shown = empty[0]
         shown.goto(url)
         shown.wait_for_selector("body[data-ready]")
         at_rest(shown)
@@ -267,11 +275,15 @@ def test_effects_of_a_renderer_have_sliders(browser, rendered):
         shown.click("#reset")
         at_rest(shown)
         assert np.abs(pixels(shown, "#view-sheet") - before).mean() < 1
-        shown.context.close()
 
 
-def test_it_fits_every_width_and_follows_the_dark(browser, address):
+def test_it_fits_every_width_and_follows_the_dark_and_without_webgl_the_server_draws(browser, address):
     shown = begun(browser, viewport={"width": 390, "height": 844}, color_scheme="dark", has_touch=True)
+    shown.add_init_script(
+        "const get = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) "
+        "{ return kind === 'webgl2' ? null : get.call(this, kind, ...more); };"
+    )
     shown.goto(address)
     shown.wait_for_selector("body[data-ready]")
     assert shown.get_attribute("#view", "height") == "512"
@@ -283,17 +295,7 @@ def test_it_fits_every_width_and_follows_the_dark(browser, address):
             box = shown.locator(name).bounding_box()
             assert box["y"] > 0 and box["y"] + box["height"] <= height and box["width"] > 100
     assert shown.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 22, 26)"
-    shown.context.close()
 
-
-def test_without_webgl_the_server_draws_the_orbit(browser, address):
-    shown = begun(browser, viewport={"width": 900, "height": 900})
-    shown.add_init_script(
-        "const get = HTMLCanvasElement.prototype.getContext;"
-        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) "
-        "{ return kind === 'webgl2' ? null : get.call(this, kind, ...more); };"
-    )
-    shown.goto(address)
     shown.wait_for_selector('#surface[data-drawn="server"][width="256"]')
     shown.wait_for_timeout(500)
     front = pixels(shown, "#surface")
