@@ -17,7 +17,6 @@ from derender import FeatureTable
 from derender.cli import console, main
 from derender.cli.console import duration
 from derender.report.decomposition import COLUMN_MEANING
-from derender.report.viewer.images import rendered_examples
 from derender.settings import plain
 from derender.storage.places import bundled_models
 from derender.training import derender_task
@@ -70,7 +69,7 @@ SLOW = ("numba", "matplotlib", "sklearn", "scipy", "pyarrow", "torch._dynamo", "
 def test_one_image_is_opened_without_slow_packages(tmp_path):
     """`decompose` imports none of them, and `relight` after it in the same process not these three."""
     file, later = tmp_path / "a.png", ("sklearn", "torch._dynamo", "tensorboard")
-    Image.fromarray(rendered_examples("faces-64", 64)[0].picture).save(file)  # which suits the model
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).save(file)
     first = f"assert main(['decompose', '{file}', '-o', '{tmp_path / 'parts'}']) == 0"
     first += f"; assert not {set(SLOW)} & set(sys.modules), {set(SLOW)} & set(sys.modules)"
     words = ("relight", file, "-o", tmp_path / "out", "--film", "none", "--stills", "2", "--size", "64")
