@@ -1,11 +1,16 @@
 """Fixtures every test may use: development data beside the checkout, seeds, tolerances."""
 
+import dataclasses
 import gc
+import inspect
 import os
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any, get_args
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -15,6 +20,32 @@ LONGEST = ("test_readers_refuse_what_is_broken", "test_two_processes")
 LONGEST += ("test_what_fails_in_all_processes",)  # with the two processes of those before
 LONGEST += ("test_a_kill_at_any_step",)  # which forks: the sooner, the smaller a process is copied
 gc.disable()  # until all is imported, which then stays: no collection looks at it again
+
+_JAXTYPED = jaxtyping.jaxtyped
+
+
+def shaped(hint: Any) -> bool:
+    """Whether a type is, or contains, that of an array of some shape."""
+    own = inspect.isclass(hint) and issubclass(hint, jaxtyping.AbstractArray)
+    return own or any(map(shaped, get_args(hint)))
+
+
+def checked(fn: Any = None, *, typechecker: Callable) -> Any:
+    """jaxtyping's decorator, only where shapes have to agree; elsewhere the type checker, once a call."""
+    if fn is None:
+        return partial(checked, typechecker=typechecker)
+    if inspect.isclass(fn):
+        if dataclasses.is_dataclass(fn):
+            fn.__init__ = checked(fn.__init__, typechecker=typechecker)
+        return fn
+    hints = fn.__annotations__.values()
+    if any(isinstance(hint, str) for hint in hints):  # perhaps of a module that is not imported here
+        return _JAXTYPED(fn, typechecker=typechecker)
+    once = typechecker(fn)
+    return _JAXTYPED(once, typechecker=None) if any(map(shaped, hints)) else once
+
+
+jaxtyping.jaxtyped = checked  # which it puts around all functions; its own takes a fifth of the suite
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
