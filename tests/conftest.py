@@ -45,7 +45,7 @@ def checked(fn: Any = None, *, typechecker: Callable) -> Any:
     return _JAXTYPED(once, typechecker=None) if any(map(shaped, hints)) else once
 
 
-jaxtyping.jaxtyped = checked  # which it puts around all functions; its own takes a fifth of the suite
+jaxtyping.jaxtyped = checked  # which the import hook puts around all functions
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

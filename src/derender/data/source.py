@@ -98,7 +98,7 @@ class Source(Closing, ABC):
 
     def images_in(self, folder: str) -> list[str]:
         """The images in folders of that name."""
-        return [file for file in self.images if folder in file and parent_name(file) == folder]
+        return [file for file in self.images if parent_name(file) == folder]
 
     @cached_property
     def _by_name(self) -> dict[str, str]:
