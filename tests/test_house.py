@@ -29,7 +29,7 @@ BUDGET = {  # lines, files
     "scene": (847, 11),
     "demo": (458, 3),
     "renderers": (627, 8),
-    "learn": (896, 5),
+    "learn": (897, 5),
 }
 TOTAL = (36_997, 233)
 TEST_LINES = 25_967

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, StringConstraints
 
 from derender.baselines import BASELINES, CONTROLS, TRAINED, baseline_config
+from derender.evaluation.options import COUNTS
 from derender.features import named
 from derender.overrides import checked
 from derender.settings import ONE_OR_MANY, Names, Settings
@@ -85,7 +86,7 @@ class Plan(Settings):
     methods: Annotated[dict[Name, Method], BeforeValidator(_methods)] = Field(default_factory=dict)
     score: dict[Name, ScoredSet] = Field(default_factory=dict)
     clustering: Literal["ward", "finch", "k-means"] = "ward"
-    counts: tuple[int, ...] = (100, 500, 1_000)  # labelled rows of the linear protocol
+    counts: tuple[int, ...] = COUNTS  # labelled rows of the linear protocol
     draws: int = Field(default=5, ge=1)  # random subsets of these rows
     untrained_seeds: int = Field(default=3, ge=1)
     resamples: int = Field(default=1_000, ge=2)
