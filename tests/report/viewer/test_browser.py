@@ -106,6 +106,15 @@ def set_slider(page, name: str, value: float) -> None:
     at_rest(page)
 
 
+def until(page, seen) -> None:
+    """Wait, as long as a slow machine needs, until something is seen."""
+    for _ in range(PATIENCE_MS // 100):
+        if seen():
+            return
+        page.wait_for_timeout(100)
+    pytest.fail("it was never seen")
+
+
 def at_rest(page) -> None:
     page.wait_for_selector('#view[data-still="true"]')
     page.wait_for_selector("body:not([data-busy])")
@@ -188,11 +197,9 @@ def test_the_result_is_dragged_compared_and_reset_and_the_surface_turned(page):
     page.focus("#surface")
     for _ in range(5):
         page.keyboard.press("ArrowRight")
-    page.wait_for_timeout(300)
-    assert np.abs(pixels(page, "#surface") - front).mean() > 3
+    until(page, lambda: np.abs(pixels(page, "#surface") - front).mean() > 3)
     page.keyboard.press("0")
-    page.wait_for_timeout(300)
-    assert np.abs(pixels(page, "#surface") - front).mean() < 1
+    until(page, lambda: np.abs(pixels(page, "#surface") - front).mean() < 1)
 
     page.click("#examples-second button:nth-child(3)")
     page.wait_for_selector("#swaps:visible")
@@ -302,11 +309,11 @@ def test_without_webgl_the_server_draws_the_orbit(browser, address):
     )
     shown.goto(address)
     shown.wait_for_selector('#surface[data-drawn="server"][width="256"]')
-    shown.wait_for_timeout(500)
+    at_rest(shown)
     front = pixels(shown, "#surface")
+    assert front.std() > 10
     shown.focus("#surface")
     for _ in range(5):
         shown.keyboard.press("ArrowRight")
-    shown.wait_for_timeout(1500)
-    assert front.std() > 10 and np.abs(pixels(shown, "#surface") - front).mean() > 3
+    until(shown, lambda: np.abs(pixels(shown, "#surface") - front).mean() > 3)
     shown.context.close()
