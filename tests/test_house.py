@@ -15,7 +15,7 @@ BUDGET = {  # lines, files
     "data": (6_480, 30),
     "evaluation": (6_893, 32),
     "report": (3_694, 21),
-    "cli": (2_078, 28),
+    "cli": (2_080, 28),
     "training": (3_435, 19),
     "baselines": (2_308, 11),
     "render": (1_661, 15),
@@ -31,8 +31,8 @@ BUDGET = {  # lines, files
     "renderers": (627, 8),
     "learn": (897, 5),
 }
-TOTAL = (36_997, 233)
-TEST_LINES = 25_973
+TOTAL = (36_999, 233)
+TEST_LINES = 25_984
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -275,6 +275,17 @@ def test_one_image_is_written_as_a_single_file(tiny, photos, tmp_path, refused):
     assert not list(tmp_path.glob("x.*"))
 
 
+@pytest.mark.parametrize(("command", "file"), [("rotate", "strip.png"), ("mesh", "0.glb")])
+def test_without_out_the_folder_is_named_after_the_command(
+    tiny, photos, tmp_path, monkeypatch, refused, command, file
+):
+    monkeypatch.chdir(tmp_path)
+    words = [command, photos / "0.png", "-m", tiny, "--size", 32, "--fit-steps", 0]
+    words += ["--film", "none"] * (command == "rotate")
+    assert run(*words) == 0 and (tmp_path / f"derender-{command}" / "0" / file).exists()
+    assert f"derender-{command}/0 exists already" in refused(*words)
+
+
 def test_bad_questions_about_pictures(tiny, photos, tmp_path, refused):
     one, out = photos / "0.png", tmp_path / "out"
     given = ("-m", tiny, one, "-o", out)

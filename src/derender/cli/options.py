@@ -74,6 +74,8 @@ def command(name: str, example: str, group: typer.Typer = app) -> Callable[[Call
                     if words := dict(default.metadata):
                         type_ = Annotated[type_, typer.Option(*words.pop("names"), **words)]  # pyrefly: ignore[not-a-type]
                     default = Parameter.empty if default.default is MISSING else default.default
+                    if isinstance(default, Path):
+                        default = Path(f"{default}-{name}")
                 shown.append(Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=type_))
 
         @functools.wraps(function)
@@ -264,7 +266,7 @@ class ImageFiles:
     """Image files, and the folder for what is made of them."""
 
     images: Annotated[list[Path], typer.Argument(help="Images, videos or their folders.", metavar="IMAGE...")]
-    out: Path = option(..., OUT_IMAGES, "--out", "-o", metavar="DIR|FILE")
+    out: Path = option(Path("derender"), OUT_IMAGES, "--out", "-o", metavar="DIR|FILE")
     resume: bool = option(False, "Leave out images that are done.", "--resume")
 
     def __post_init__(self) -> None:
