@@ -13,12 +13,12 @@ from tests.test_project import PACKAGE, SOURCES, TESTS, syntax
 
 BUDGET = {  # lines, files
     "data": (6_480, 30),
-    "evaluation": (6_893, 32),
+    "evaluation": (6_877, 32),
     "report": (3_694, 21),
     "cli": (2_080, 28),
-    "training": (3_435, 19),
+    "training": (3_444, 19),
     "baselines": (2_308, 11),
-    "render": (1_661, 15),
+    "render": (1_660, 15),
     "features": (1_246, 8),
     "interpretation": (1_023, 5),
     "photo": (1_556, 7),
@@ -31,8 +31,8 @@ BUDGET = {  # lines, files
     "renderers": (627, 8),
     "learn": (897, 5),
 }
-TOTAL = (36_999, 233)
-TEST_LINES = 25_984
+TOTAL = (36_992, 233)
+TEST_LINES = 25_991
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -25,6 +25,7 @@ from derender.storage.atomic import DamageNoticed
 from derender.training import TrainingInterrupted, loop, resolve, train, watch
 from derender.training.batches import Batches
 from derender.training.checkpoint import WEIGHTS_FILE, load_checkpoint
+from derender.training.config import OptimiserSettings
 from derender.training.loop import kept
 from derender.training.run_folder import read_config, read_metrics
 from derender.training.task import Progress
@@ -144,12 +145,18 @@ def test_self_trained_perceptual_features_are_kept_for_the_resumed_run(pictures,
     assert_same_weights(tmp_path / "whole", tmp_path / "parts")
 
 
-def test_patience_ends_a_run_that_no_longer_improves_and_minutes_end_any(pictures, tmp_path):
+def test_patience_ends_a_run_that_no_longer_improves_and_minutes_end_any(pictures, tmp_path, monkeypatch):
     config = resolve("small", [*TINY, "images=3200", "patience=2", "learning_rate=1e-12", "watch=false"])
     result = train(config, pictures, tmp_path / "run")
     assert result.stopped == "patience" and result.images <= 32 * 8
-    result = train(resolve("small", [*TINY, "images=1000000", "minutes=0.01"]), pictures, tmp_path / "short")
+    rates, rate, reports = [], OptimiserSettings.rate, []
+    monkeypatch.setattr(OptimiserSettings, "rate", lambda *of: rates.append(rate(*of)) or rates[-1])
+    monkeypatch.setattr(loop, "READ_EVERY_STEPS", 1)
+    config = resolve("small", [*TINY, "images=1000000", "minutes=0.03", "final_rate=0.1"])
+    result = train(config, pictures, tmp_path / "short", progress=reports.append)
     assert result.stopped == "minutes" and (tmp_path / "short" / "checkpoints" / "last").is_dir()
+    assert rates[0] > 9.9e-4 and rates[-1] < 4e-4  # schedules end with the minutes
+    assert result.images <= reports[-1].total < 2 * result.images
 
 
 @pytest.fixture(scope="module")

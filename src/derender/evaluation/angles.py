@@ -66,13 +66,9 @@ def agreement_table(
 
 
 def pose(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    table: str | Path | None = None,
-    *,
-    fit_steps: int | None = None,
-    **options: Any,
-) -> Scores:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, table: str | Path | None = None, *,
+    fit_steps: int | None = None, **options: Any,
+) -> Scores:  # fmt: skip
     """Yaw, pitch and roll of the head against known angles in degrees: r and slope best 1, error best 0.
 
     Args:
@@ -91,13 +87,9 @@ def pose(
 
 
 def light(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    table: str | Path | None = None,
-    *,
-    fit_steps: int | None = None,
-    **options: Any,
-) -> Scores:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, table: str | Path | None = None, *,
+    fit_steps: int | None = None, **options: Any,
+) -> Scores:  # fmt: skip
     """Azimuth and elevation of the light in the camera's frame, in degrees, against known ones.
 
     Positive azimuth lights the left of the image, positive elevation comes from above. A further table has

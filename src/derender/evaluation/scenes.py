@@ -34,13 +34,9 @@ Protocols = dict[str, tuple[type[ImageResult], Callable[[], Any]]]  # the result
 
 
 def geometry(
-    model: Derenderer | str | Path,
-    truth: GroundTruth | str | Path,
-    *,
-    fit_steps: int | None = None,
-    batch_size: int = 64,
-    **options: Any,
-) -> Scores:
+    model: Derenderer | str | Path, truth: GroundTruth | str | Path, *, fit_steps: int | None = None,
+    batch_size: int = 64, **options: Any,
+) -> Scores:  # fmt: skip
     """Is the geometry the true one? SIDE and MAD on rendered images with exact depth, beside controls.
 
     Errors of albedo, light and camera follow where the truth has them, then those of the reconstruction.
@@ -71,14 +67,10 @@ def geometry(
 
 
 def reconstruction(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    *,
-    training_images: ImageSet | None = None,
-    fit_steps: int | None = None,
-    batch_size: int = 64,
+    model: Derenderer | str | Path, images: ImageSet | str | Path, *,
+    training_images: ImageSet | None = None, fit_steps: int | None = None, batch_size: int = 64,
     **options: Any,
-) -> Scores:
+) -> Scores:  # fmt: skip
     """How well are images reconstructed? L1, PSNR and SSIM inside the mask, beside controls.
 
     These are the mean image, 64 principal components of the pixels, and an untrained model.

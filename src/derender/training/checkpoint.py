@@ -40,6 +40,12 @@ class TrainState:
     watcher: dict[str, Any] = field(default_factory=dict)  # the state of the collapse detector
     compiled: bool | None = None  # whether networks are; None where that was never asked for
 
+    def expected_images(self, config: Any) -> int:
+        """Images of the whole run: those of its settings, or fewer that its minutes leave time for."""
+        if config.minutes is None or not self.images * self.seconds:
+            return config.images
+        return round(min(config.images, self.images * 60 * config.minutes / self.seconds))
+
     def ended_by(self, config: Any) -> str | None:
         """The setting that lets a run with these counters train no further, if there is one."""
         if self.images >= config.images:

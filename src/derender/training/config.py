@@ -111,7 +111,7 @@ class LoopSettings(Settings):
     optimiser: OptimiserSettings = OptimiserSettings()
     batch_size: int = Field(default=64, ge=2)
     images: int = Field(default=600_000, ge=1)  # images of the whole run, repeats counted
-    minutes: float | None = Field(default=None, gt=0)  # stop earlier once training has taken this long
+    minutes: float | None = Field(default=None, gt=0)  # end the run, and its schedules, by then
     validate_every: int = Field(default=20_000, ge=1)  # images between validations
     sample_every: int = Field(default=20_000, ge=1)  # images between sample sheets
     checkpoint_every: int = Field(default=20_000, ge=1)  # images between checkpoints

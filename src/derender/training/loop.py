@@ -87,6 +87,7 @@ class _Run:
         self.held_out = torch.from_numpy(np.ascontiguousarray(images.images[held_out])).to(fabric.device)
         both = self.folder.last, self.folder.previous  # of a new run neither is there
         self.state, note = checkpoint.resume_from(*both, self.model, self.optimiser)
+        self.expected_images = self.state.expected_images(config)
         self.fell_back = note is not None  # the damaged checkpoint is not to become the previous one
         self.watcher = task.watch(self.state.watcher) if config.watch else None
         self.validation: dict[str, float] = {}
@@ -124,16 +125,18 @@ class _Run:
                 elapsed = time.perf_counter() - began
                 state.seconds, speed = seconds_before + elapsed, (state.images - images_before) / elapsed
                 waiting, terms = self.reader.waited_s / elapsed, None
+                total = max(state.images, self.expected_images)
                 if steps % LOG_EVERY_STEPS == 1:
                     terms = self.ranks.mean(_on_host(result.terms))
                     self.log("train", {**terms, "images_per_second": speed, "waiting": waiting})
-                self.report(tasks.Progress("train", state.images, config.images, speed, terms, waiting))
+                self.report(tasks.Progress("train", state.images, total, speed, terms, waiting))
 
                 span = before, state.images
                 if self.position % READ_EVERY_STEPS and not self.due(*span, stop=signals.is_set()):
                     continue
                 elapsed, interrupted = self.ranks.largest(elapsed, signals.is_set())
                 state.seconds = seconds_before + elapsed
+                self.expected_images = state.expected_images(config)
                 self.read_notes()
                 stopped = self.why_stop()
                 healthy = stopped != "collapse" and (self.watcher is None or not self.watcher.uneasy)
@@ -171,12 +174,12 @@ class _Run:
     def step(self) -> tasks.StepLosses:
         """One batch: losses, gradients, update, watcher."""
         config, state = self.config, self.state
-        position, done = self.position, state.images / config.images
+        position, done = self.position, state.images / self.expected_images
         watched = self.watcher if position % READ_EVERY_STEPS == 0 else None
         if watched is not None and (repaired := watched.repair(self.model, self.optimiser)):
             self.note(repaired)
         for group in self.optimiser.param_groups:
-            rate = group.get("share", 1.0) * config.optimiser.rate(state.images, config.images)
+            rate = group.get("share", 1.0) * config.optimiser.rate(state.images, self.expected_images)
             group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         drawn = random_stream(config.seed, "perturb", position)
         if self.noise is not None:
