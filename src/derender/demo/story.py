@@ -124,7 +124,7 @@ class DemoSettings(Settings):
     train_pictures: int = Field(default=4_000, ge=20)
     test_pictures: int = Field(default=240, ge=16)
     images: int = Field(default=20_000, ge=2)  # images seen in training, repeats counted
-    minutes: float = Field(default=3.4, gt=0)  # training stops here on a slow machine
+    minutes: float = Field(default=5, gt=0)  # training stops here on a slow machine
     fit_steps: int = Field(default=2 * STEPS, ge=0)  # of each unseen scene before its depth is scored
     shown: int = Field(default=8, ge=1)  # unseen images on the page
     films: int = Field(default=4, ge=1)
