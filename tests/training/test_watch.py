@@ -157,8 +157,8 @@ def test_a_memory_that_no_watcher_gave_is_refused(memory):
 
 
 COLLAPSING = ["image_size=32", "width=4", "light_width=4", "batch_size=16", "perceptual=none", "images=4000"]
-COLLAPSING += ["curvature_weight=0", "learning_rate=1e-2", "weight_decay=0", "warmup_images=0"]
-COLLAPSING += ["final_rate=1", "whitening.pictures=0", "fitting.examples=0"]
+COLLAPSING += ["curvature_weight=0", "learning_rate=2e-2", "weight_decay=0", "warmup_images=0"]
+COLLAPSING += ["final_rate=1", "whitening.pictures=0", "fitting.examples=0", "seed=3"]
 SOONER = 16
 """By how much the clock of the watcher is faster in a real collapse."""
 
@@ -184,7 +184,7 @@ def test_a_real_collapse_is_caught_while_its_loss_still_falls(generated, tmp_pat
     assert results & {"saturated depth", "torn depth", "view at its bound"}
     rows = read_metrics(tmp_path / "run")
     errors = [row["l1"] for row in rows if row["kind"] == "train"]
-    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while; 0.38 with torch 2.15
+    assert errors[-1] < 0.7 * errors[0]  # the images look better all the while
     assert results <= set(rows[-1])
 
 

@@ -42,14 +42,14 @@ def read_tensors(file: str | Path, like: Tensors | None = None) -> dict[str, Ten
 
 
 def read_described(file: str | Path, like: Tensors | None = None) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """As ``read_tensors``, with the file's metadata."""
+    """As ``read_tensors``, with the file's metadata. Copies are aligned: sums are those before saving."""
     expected = None if like is None else sum(value.numel() for value in like.values())
     most = LIMIT_BYTES if expected is None else min(LIMIT_BYTES, 16 * expected + _HEADER_BYTES)
     try:
         require_regular(Path(file), most)
         with safe_open(file, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118, not a mapping
+            tensors = {name: stored.get_tensor(name).clone() for name in stored.keys()}  # noqa: SIM118
     except (SafetensorError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(f"{Path(file).name} is cut off or no safetensors file ({error})") from error
     if metadata.get(CHECKSUM, checksum(tensors)) != checksum(tensors):
