@@ -84,6 +84,13 @@ def test_edits_change_the_face_and_leave_the_rest(photo, model):
         assert np.abs(np.asarray(same).astype(int) - before).max() <= 1
 
 
+def test_what_the_border_cuts_off_leaves_no_streak_beside_it(model):
+    photo = np.full((96, 96, 3), 120, np.uint8)
+    photo[44:50, :8] = 250  # as an ear
+    detail = open_photograph(photo, model, frame="none").detail.photo[0]
+    assert float(detail[:, 36].max()) > 0.9 and 0 < float(detail[:, 0].max()) - 120 / 255 < 0.15
+
+
 def test_scenes_are_optimised_before_they_are_edited_and_those_of_decompose(photo, model):
     pixels, steps = np.asarray(photo), (FIT_STEPS, 0, None)
     optimised, predicted, usual = (open_photograph(pixels, model, fit_steps=one).scene for one in steps)

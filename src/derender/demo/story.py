@@ -188,13 +188,10 @@ class DemoResult:
 
 
 def run_demo(
-    out: str | Path,
-    settings: DemoSettings = FULL,
-    *,
-    seed: int = 0,
+    out: str | Path, settings: DemoSettings = FULL, *, seed: int = 0,
     report: Report = lambda stage, done, total, note: None,
     opened: Callable[[Path], object] = lambda page: None,
-) -> DemoResult:
+) -> DemoResult:  # fmt: skip
     """Generate, train, score; the training's run folder is ``out/run``.
 
     ``opened`` is called with ``out/report.html`` once that shows photographs, before anything is trained.
@@ -252,14 +249,10 @@ def run_demo(
 
 
 def run_own_demo(
-    images: str | Path,
-    out: str | Path,
-    settings: DemoSettings = FULL,
-    *,
-    seed: int = 0,
+    images: str | Path, out: str | Path, settings: DemoSettings = FULL, *, seed: int = 0,
     report: Report = lambda stage, done, total, note: None,
     opened: Callable[[Path], object] = lambda page: None,
-) -> Path:
+) -> Path:  # fmt: skip
     """The same with images of the user's own: edit, train, decompose held-out ones. Gives the page.
 
     What needs true depth or names of people is left out. ``out`` and ``opened`` are as in `run_demo`.

@@ -25,17 +25,10 @@ from derender.features import missing
 
 
 def cluster(
-    features: feature_rows.FeatureSource,
-    label: str | Sequence[str] | None = None,
-    *,
-    attributes: bool = False,
-    method: str = "ward",
-    clusters: int | None = None,
-    mean_by: Sequence[str] = (),
-    min_count: int = 1,
-    max_count: int | None = None,
-    **options: Any,
-) -> Scores:
+    features: feature_rows.FeatureSource, label: str | Sequence[str] | None = None, *,
+    attributes: bool = False, method: str = "ward", clusters: int | None = None, mean_by: Sequence[str] = (),
+    min_count: int = 1, max_count: int | None = None, **options: Any,
+) -> Scores:  # fmt: skip
     """Cluster features and score the clusters by labels, beside controls; every score is best at 1.
 
     Args:
@@ -98,16 +91,10 @@ class ClusterComparison:
 
 
 def compare_clusterings(
-    features: Mapping[str, Sequence[np.ndarray]],
-    labels: Mapping[str, np.ndarray],
-    *,
-    controls: Collection[str] = (),
-    method: str = "ward",
-    n_clusters: int | None = None,
-    resample_count: int = bootstrap.RESAMPLES,
-    seed: int = 0,
-    memory: Memory | None = None,
-) -> ClusterComparison:
+    features: Mapping[str, Sequence[np.ndarray]], labels: Mapping[str, np.ndarray], *,
+    controls: Collection[str] = (), method: str = "ward", n_clusters: int | None = None,
+    resample_count: int = bootstrap.RESAMPLES, seed: int = 0, memory: Memory | None = None,
+) -> ClusterComparison:  # fmt: skip
     """Cluster and score every row of features on the same images.
 
     ``features`` holds by name one (N, D) array for each run (seed), ``labels`` by name (N,) classes; scores

@@ -191,13 +191,9 @@ def approximation(method: str, n_rows: int) -> str:
 
 
 def clusterings(
-    features: np.ndarray,
-    counts: Iterable[int],
-    method: str = "ward",
-    *,
-    seed: int = 0,
+    features: np.ndarray, counts: Iterable[int], method: str = "ward", *, seed: int = 0,
     memory: Memory | None = None,
-) -> dict[int, np.ndarray]:
+) -> dict[int, np.ndarray]:  # fmt: skip
     """Cluster finite (N, D) features into each of the numbers in ``counts``: by number, (N,) integers.
 
     ``method`` is one of ``METHODS``, ``seed`` for the starts of k-means, ``memory`` the cache of the trees.

@@ -156,13 +156,9 @@ def attribute_columns(labels: Mapping[str, np.ndarray], least: int = 0) -> tuple
 
 
 def prepare(
-    rows: Sequence[FeatureRow],
-    labels: Sequence[str],
-    *,
-    mean_by: Sequence[str] = (),
-    min_count: int = 1,
+    rows: Sequence[FeatureRow], labels: Sequence[str], *, mean_by: Sequence[str] = (), min_count: int = 1,
     max_count: int | None = None,
-) -> Prepared:
+) -> Prepared:  # fmt: skip
     """Check that all tables fit together; average, choose rows; labels are those of the first table.
 
     Args:

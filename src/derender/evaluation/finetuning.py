@@ -220,14 +220,9 @@ class FinetuneTask(TrainingTask):
 
 
 def score_finetuned(
-    tuned: FinetunedModel,
-    task: FinetuneTask,
-    *,
-    began: str = "fresh weights",
-    resample_count: int = bootstrap.RESAMPLES,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
-) -> Scores:
+    tuned: FinetunedModel, task: FinetuneTask, *, began: str = "fresh weights",
+    resample_count: int = bootstrap.RESAMPLES, memory: Memory | None = None, progress: Progress | None = None,
+) -> Scores:  # fmt: skip
     """Held-out scores of ``fine-tuned``, of heads on frozen features and of controls, 0..1, best 1.
 
     Beside it stand both heads on the frozen features of ``began``, logistic regression on three controls, and

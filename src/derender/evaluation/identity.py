@@ -28,16 +28,10 @@ FOLDS = 10
 
 
 def identify(
-    features: FeatureSource,
-    label: str = "identity",
-    *,
-    by: str | None = None,
-    bins: Sequence[float] = LIGHT_BINS_DEG,
-    gallery: str | None = None,
-    centred: bool = True,
-    cluster_within: float = 50.0,
-    **options: Any,
-) -> Scores:
+    features: FeatureSource, label: str = "identity", *, by: str | None = None,
+    bins: Sequence[float] = LIGHT_BINS_DEG, gallery: str | None = None, centred: bool = True,
+    cluster_within: float = 50.0, **options: Any,
+) -> Scores:  # fmt: skip
     """Share of probes whose nearest gallery image, by cosine, shows the same person; 0 to 1, best 1.
 
     Args:

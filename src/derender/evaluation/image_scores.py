@@ -73,11 +73,9 @@ def means_and_each(**scores: Tensor) -> dict[str, Any]:
 
 
 def image_rows(
-    scores: Mapping[str, Mapping[str, np.ndarray]],
-    columns: Mapping[str, Column],
-    weights: np.ndarray,
+    scores: Mapping[str, Mapping[str, np.ndarray]], columns: Mapping[str, Column], weights: np.ndarray,
     controls: Collection[str] | None = None,
-) -> tuple[bootstrap.ScoredRow, ...]:
+) -> tuple[bootstrap.ScoredRow, ...]:  # fmt: skip
     """A row for each name in ``scores``, which holds every score's (N,) values of the same images, NaN where
     there is none. ``weights`` are by ``once_and_resampled``, ``controls`` by default all rows but the first.
     """
@@ -91,15 +89,10 @@ def image_rows(
 
 
 def binned_rows(
-    scores: Mapping[str, np.ndarray],
-    angle: np.ndarray,
-    weights: np.ndarray,
-    controls: Collection[str] | None = None,
-    *,
-    best: Literal["high", "low"] = "high",
-    digits: int = 3,
+    scores: Mapping[str, np.ndarray], angle: np.ndarray, weights: np.ndarray,
+    controls: Collection[str] | None = None, *, best: Literal["high", "low"] = "high", digits: int = 3,
     bins: Sequence[float] = LIGHT_BINS_DEG,
-) -> tuple[tuple[bootstrap.ScoredRow, ...], dict[str, Column], dict[str, int]]:
+) -> tuple[tuple[bootstrap.ScoredRow, ...], dict[str, Column], dict[str, int]]:  # fmt: skip
     """Rows of (N,) scores; columns for all and for groups by (N,) angles in degrees; images in each.
 
     ``bins`` are upper edges; larger angles are "beyond", NaN in no group. The rest is as of ``image_rows``.

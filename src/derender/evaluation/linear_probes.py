@@ -56,16 +56,9 @@ PAPER_HEAD = HeadSettings()
 
 
 def probe(
-    head: str,
-    features: np.ndarray,
-    task: Task,
-    rows: np.ndarray,
-    tested: np.ndarray,
-    seeds: Sequence[int],
-    *,
-    settings: HeadSettings = PAPER_HEAD,
-    memory: Memory | None = None,
-) -> np.ndarray:
+    head: str, features: np.ndarray, task: Task, rows: np.ndarray, tested: np.ndarray, seeds: Sequence[int],
+    *, settings: HeadSettings = PAPER_HEAD, memory: Memory | None = None,
+) -> np.ndarray:  # fmt: skip
     """Learn from some rows and answer for others, once for each seed: (S, T, A) float32 probabilities.
 
     ``features`` are (N, D), ``rows`` (S, n) training rows, the (T,) ``tested`` rows take no part in any
@@ -134,13 +127,9 @@ def _shares(targets: np.ndarray) -> np.ndarray:
 
 
 def fitted_heads(
-    features: np.ndarray,
-    task: Task,
-    rows: np.ndarray,
-    seeds: Sequence[int],
-    settings: HeadSettings,
+    features: np.ndarray, task: Task, rows: np.ndarray, seeds: Sequence[int], settings: HeadSettings,
     centred: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Train one head for each seed at once: (S, 1, D) means, (S, D, A) weights, (S, 1, A) biases.
 
     Args:
@@ -202,14 +191,9 @@ def rotated(features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def logistic_weights(
-    features: np.ndarray,
-    targets: np.ndarray,
-    *,
-    kind: str,
-    penalties: Sequence[float] = PENALTIES,
-    folds: int = FOLDS,
-    seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    features: np.ndarray, targets: np.ndarray, *, kind: str, penalties: Sequence[float] = PENALTIES,
+    folds: int = FOLDS, seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Choose C by cross-validation and fit on all rows: (D, A) weights, (A,) biases, and the chosen C.
 
     ``features`` are (n, D), ``targets`` (n, A) in -1 (unknown), 0, 1, one-hot for classes. Of kind "labels"

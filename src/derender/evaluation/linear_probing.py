@@ -48,22 +48,12 @@ PROBE_NAMES = {**probes.PROBES, FINETUNED: "the paper's head, encoders trained t
 
 
 def linear(
-    features: feature_rows.FeatureSource,
-    label: str | Sequence[str] | None = None,
-    *,
-    attributes: bool = False,
-    counts: Sequence[int] = COUNTS,
-    heads: Sequence[str] = probes.HEADS,
-    seeds: int = 5,
-    test_fraction: float = 0.5,
-    groups: str | None = None,
-    finetune: bool = False,
-    epochs: int = 100,
-    min_count: int = 1,
-    max_count: int | None = None,
-    untrained_seeds: int = 5,
+    features: feature_rows.FeatureSource, label: str | Sequence[str] | None = None, *,
+    attributes: bool = False, counts: Sequence[int] = COUNTS, heads: Sequence[str] = probes.HEADS,
+    seeds: int = 5, test_fraction: float = 0.5, groups: str | None = None, finetune: bool = False,
+    epochs: int = 100, min_count: int = 1, max_count: int | None = None, untrained_seeds: int = 5,
     **options: Any,
-) -> Scores:
+) -> Scores:  # fmt: skip
     """Probe features with linear heads that learn from few labels, beside controls; every score is best at 1.
 
     Args:
@@ -141,17 +131,11 @@ class LinearComparison:
 
 
 def compare_prepared(
-    ready: feature_rows.Prepared,
-    counts: Sequence[int],
-    seeds: Sequence[int],
-    options: Options,
-    *,
-    heads: Sequence[str] = probes.HEADS,
-    settings: probes.HeadSettings = probes.PAPER_HEAD,
-    models: Mapping[str, Sequence[feature_rows.ModelSource]] | None = None,
-    supervised: bool = False,
+    ready: feature_rows.Prepared, counts: Sequence[int], seeds: Sequence[int], options: Options, *,
+    heads: Sequence[str] = probes.HEADS, settings: probes.HeadSettings = probes.PAPER_HEAD,
+    models: Mapping[str, Sequence[feature_rows.ModelSource]] | None = None, supervised: bool = False,
     **rows: Any,
-) -> LinearComparison:
+) -> LinearComparison:  # fmt: skip
     """Ask rows that were put side by side for all their labels, in their owners' split where there is one.
 
     ``models``, by name, are trained together with the head; with ``supervised`` a ResNet-18, too. Seed s
@@ -197,19 +181,12 @@ def compare_prepared(
 
 
 def compare_linear(
-    features: Mapping[str, Sequence[np.ndarray]],
-    task: Task,
-    rows: Rows,
-    seeds: Sequence[int],
-    *,
-    controls: Collection[str] = (),
-    heads: Sequence[str] = probes.HEADS,
+    features: Mapping[str, Sequence[np.ndarray]], task: Task, rows: Rows, seeds: Sequence[int], *,
+    controls: Collection[str] = (), heads: Sequence[str] = probes.HEADS,
     finetuned: Mapping[str, Mapping[int, np.ndarray]] | None = None,
-    settings: probes.HeadSettings = probes.PAPER_HEAD,
-    resample_count: int = bootstrap.RESAMPLES,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
-) -> LinearComparison:
+    settings: probes.HeadSettings = probes.PAPER_HEAD, resample_count: int = bootstrap.RESAMPLES,
+    memory: Memory | None = None, progress: Progress | None = None,
+) -> LinearComparison:  # fmt: skip
     """Probe every row of features with every head.
 
     ``features`` holds by name one (N, D) array for each run of the same thing; seed s uses run s modulo their
@@ -262,17 +239,10 @@ def linear_tables(result: LinearComparison) -> list[ScoreTable]:
 
 
 def finetune(
-    model: Any,
-    images: np.ndarray,
-    task: Task,
-    rows: np.ndarray,
-    tested: np.ndarray,
-    *,
-    factors: Sequence[str] = ("geometry", "albedo"),
-    seed: int = 0,
-    settings: probes.HeadSettings = probes.PAPER_HEAD,
-    progress: Progress | None = None,
-) -> np.ndarray:
+    model: Any, images: np.ndarray, task: Task, rows: np.ndarray, tested: np.ndarray, *,
+    factors: Sequence[str] = ("geometry", "albedo"), seed: int = 0,
+    settings: probes.HeadSettings = probes.PAPER_HEAD, progress: Progress | None = None,
+) -> np.ndarray:  # fmt: skip
     """Train copies of the factors' encoders with a new head, answer for the test rows: (T, A) probabilities.
 
     The model, ours or a baseline, stays as it was. ``images`` are (N, 3, H, W) uint8, ``rows`` (n,) training

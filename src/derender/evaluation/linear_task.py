@@ -68,12 +68,9 @@ def task_of(labels: Mapping[str, np.ndarray]) -> Task:
 
 
 def choose_rows(
-    task: Task,
-    files: Sequence[str],
-    counts: Sequence[int] = COUNTS,
-    seeds: Sequence[int] = (0, 1, 2, 3, 4),
+    task: Task, files: Sequence[str], counts: Sequence[int] = COUNTS, seeds: Sequence[int] = (0, 1, 2, 3, 4),
     **how: Any,
-) -> Rows:
+) -> Rows:  # fmt: skip
     """Test rows and, for every seed, nested training rows: ``counts`` of those of ``divide_rows``."""
     pool, test = divide_rows(task, files, **how)
     if not len(seeds):
@@ -88,13 +85,9 @@ def choose_rows(
 
 
 def divide_rows(
-    task: Task,
-    files: Sequence[str],
-    *,
-    test_fraction: float = 0.5,
-    partition: np.ndarray | None = None,
+    task: Task, files: Sequence[str], *, test_fraction: float = 0.5, partition: np.ndarray | None = None,
     groups: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Labelled rows that may be learned from, and those that are tested.
 
     Args:

@@ -25,19 +25,11 @@ PAPER_VARIANTS = ("joint", "geometry", "albedo", "joint-frozen", "random")
 
 
 def compare(
-    table: str,
-    features: Mapping[str, feature_rows.FeatureSource | Sequence[feature_rows.FeatureSource]],
-    images: ImageSet | str | Path | None = None,
-    *,
-    method: str = "ward",
-    counts: Sequence[int] = COUNTS,
-    seeds: int = 5,
-    finetune: bool = False,
-    supervised: bool = False,
-    masks: str | Path | None = None,
-    epochs: int = 20,
-    **options: Any,
-) -> Scores:
+    table: str, features: Mapping[str, feature_rows.FeatureSource | Sequence[feature_rows.FeatureSource]],
+    images: ImageSet | str | Path | None = None, *, method: str = "ward", counts: Sequence[int] = COUNTS,
+    seeds: int = 5, finetune: bool = False, supervised: bool = False, masks: str | Path | None = None,
+    epochs: int = 20, **options: Any,
+) -> Scores:  # fmt: skip
     """One of the paper's tables for several features and models, beside the paper's numbers and controls.
 
     Args:

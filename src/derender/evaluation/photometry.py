@@ -45,13 +45,9 @@ _SHARE = Column("share", None, note="of the groups' difference in brightness tha
 
 
 def brightness(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    *,
-    by: str | None = None,
-    fit_steps: int | None = None,
-    **options: Any,
-) -> Scores:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, *, by: str | None = None,
+    fit_steps: int | None = None, **options: Any,
+) -> Scores:  # fmt: skip
     """Is albedo as bright as the surface? Slope and r best 1, chroma error and correlation of light best 0.
 
     Args:
@@ -176,13 +172,9 @@ CONTROLS = ("input", "mean image", "another person's ratio")
 
 
 def relight(
-    model: Derenderer | str | Path,
-    images: ImageSet | str | Path,
-    *,
-    size: int = 128,
-    fit_steps: int | None = None,
-    **options: Any,
-) -> Scores:
+    model: Derenderer | str | Path, images: ImageSet | str | Path, *, size: int = 128,
+    fit_steps: int | None = None, **options: Any,
+) -> Scores:  # fmt: skip
     """PSNR in decibels and SSIM (at most 1) of relit images against photographs, inside the mask.
 
     Args:

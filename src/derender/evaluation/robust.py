@@ -35,26 +35,13 @@ _LOST = Column("lost", None, note="ordinary less area; read it beside ordinary, 
 
 def robustness(
     models: Mapping[str, feature_rows.ModelSource] | feature_rows.ModelSource,
-    images: ImageSet | str | Path | None = None,
-    *,
-    pictures: str | None = None,
-    label: str | Sequence[str] | None = None,
-    attributes: bool = False,
-    min_count: int = 1,
-    max_count: int | None = None,
-    groups: str | None = None,
-    test_fraction: float = 0.3,
-    axes: Sequence[str] = ("yaw", "light"),
-    angles: Sequence[float] = LEVELS,
-    people: int = 40,
-    learned: int = 8,
-    tested: int = 2,
-    head: str = "logistic",
-    score: str = "accuracy",
-    seeds: int = 5,
-    untrained_seeds: int = 5,
-    **options: Any,
-) -> Scores:
+    images: ImageSet | str | Path | None = None, *, pictures: str | None = None,
+    label: str | Sequence[str] | None = None, attributes: bool = False, min_count: int = 1,
+    max_count: int | None = None, groups: str | None = None, test_fraction: float = 0.3,
+    axes: Sequence[str] = ("yaw", "light"), angles: Sequence[float] = LEVELS, people: int = 40,
+    learned: int = 8, tested: int = 2, head: str = "logistic", score: str = "accuracy", seeds: int = 5,
+    untrained_seeds: int = 5, **options: Any,
+) -> Scores:  # fmt: skip
     """Does a probe learned in ordinary light and view hold in others? Curves over angles, area 1 is best.
 
     Args:
@@ -215,17 +202,10 @@ def area_under(levels: Sequence[float], values: np.ndarray) -> np.ndarray:
 
 
 def compare_robustness(
-    features: Mapping[str, Sequence[np.ndarray]],
-    trial: Trial,
-    seeds: Sequence[int],
-    *,
-    controls: Collection[str] = (),
-    head: str = "logistic",
-    resample_count: int = bootstrap.RESAMPLES,
-    seed: int = 0,
-    memory: Memory | None = None,
-    progress: Progress | None = None,
-) -> RobustnessComparison:
+    features: Mapping[str, Sequence[np.ndarray]], trial: Trial, seeds: Sequence[int], *,
+    controls: Collection[str] = (), head: str = "logistic", resample_count: int = bootstrap.RESAMPLES,
+    seed: int = 0, memory: Memory | None = None, progress: Progress | None = None,
+) -> RobustnessComparison:  # fmt: skip
     """Probe every row of features along every curve of a trial.
 
     ``features`` holds by name one (M, D) array for each run of the same features, of all images of the trial.

@@ -207,16 +207,10 @@ class Scores:
 
 
 def scored_table(
-    caption: str,
-    first: str,
-    rows: Sequence[ScoredRow],
-    columns: Mapping[str, Column],
-    *,
-    intervals: Sequence[str] | None = None,
-    deviations: Sequence[str] | None = None,
-    more: Mapping[Column, Callable[[ScoredRow], Cell]] | None = None,
-    over: str = "scored rows",
-) -> ScoreTable:
+    caption: str, first: str, rows: Sequence[ScoredRow], columns: Mapping[str, Column], *,
+    intervals: Sequence[str] | None = None, deviations: Sequence[str] | None = None,
+    more: Mapping[Column, Callable[[ScoredRow], Cell]] | None = None, over: str = "scored rows",
+) -> ScoreTable:  # fmt: skip
     """One row for each scored row, one column for each score in ``columns``.
 
     Scores in ``intervals`` are followed by their 95 % interval, those in ``deviations`` by their standard

@@ -113,17 +113,10 @@ class SegmentationComparison:
 
 
 def segment(
-    model: Any,
-    data: SegmentationData | str | Path,
-    *,
-    masks: str | Path | None = None,
-    test_fraction: float = TEST_FRACTION,
-    labelled: int | None = None,
-    variants: Sequence[str] | None = None,
-    seeds: Sequence[int] = (0, 1, 2),
-    settings: SegmentSettings | None = None,
-    **options: Any,
-) -> Scores:
+    model: Any, data: SegmentationData | str | Path, *, masks: str | Path | None = None,
+    test_fraction: float = TEST_FRACTION, labelled: int | None = None, variants: Sequence[str] | None = None,
+    seeds: Sequence[int] = (0, 1, 2), settings: SegmentSettings | None = None, **options: Any,
+) -> Scores:  # fmt: skip
     """Do pre-trained U-Net encoders help segmentation? Variants trained once a seed beside controls.
 
     Args:

@@ -61,14 +61,9 @@ class SegmentationData:
 
 
 def divide(
-    images: ImageSet,
-    masks: UInt8[np.ndarray, "n s s"],
-    classes: Sequence[str],
-    *,
-    test_fraction: float = TEST_FRACTION,
-    split_seed: int = 0,
-    labelled: int | None = None,
-) -> SegmentationData:
+    images: ImageSet, masks: UInt8[np.ndarray, "n s s"], classes: Sequence[str], *,
+    test_fraction: float = TEST_FRACTION, split_seed: int = 0, labelled: int | None = None,
+) -> SegmentationData:  # fmt: skip
     """Choose training and test images of what ``read_masks`` gave.
 
     Where the data bring a partition, its "test" rows are tested, and its "train" rows (all others, where it
@@ -169,14 +164,9 @@ class SegmentationNet(nn.Module):
     """
 
     def __init__(
-        self,
-        encoders: Sequence[UNetEncoder],
-        outputs: int,
-        *,
-        frozen: bool = False,
-        kept_statistics: bool = False,
-        decoder: UNetDecoder | None = None,
-    ):
+        self, encoders: Sequence[UNetEncoder], outputs: int, *, frozen: bool = False,
+        kept_statistics: bool = False, decoder: UNetDecoder | None = None,
+    ):  # fmt: skip
         super().__init__()
         self.frozen, self.encoders = frozen, nn.ModuleList(encoders).requires_grad_(not frozen)
         # parts whose BatchNorm keeps its statistics
@@ -228,12 +218,9 @@ def build_variant(model: Any, variant: Variant, data: SegmentationData, seed: in
 
 
 def train_segmenter(
-    net: SegmentationNet,
-    data: SegmentationData,
-    seed: int,
-    settings: SegmentSettings,
+    net: SegmentationNet, data: SegmentationData, seed: int, settings: SegmentSettings,
     progress: Callable[[int, float], object] | None = None,
-) -> list[float]:
+) -> list[float]:  # fmt: skip
     """Train in place on the training rows; the mean loss of each epoch.
 
     The seed orders the images; ``progress`` is called with (images seen, loss) after every step.

@@ -268,16 +268,9 @@ def generated_trial(recipe: Recipe, axes: Sequence[Axis], levels: tuple[float, .
 
 
 def rendered_trial(
-    model: Any,
-    pictures: ImageSet,
-    task: Task,
-    learn: np.ndarray,
-    test: np.ndarray,
-    axes: Sequence[Axis],
-    levels: tuple[float, ...],
-    how: Options,
-    groups: np.ndarray | None = None,
-) -> Trial:
+    model: Any, pictures: ImageSet, task: Task, learn: np.ndarray, test: np.ndarray, axes: Sequence[Axis],
+    levels: tuple[float, ...], how: Options, groups: np.ndarray | None = None,
+) -> Trial:  # fmt: skip
     """Re-render images at the model's size, or find them in the cache.
 
     ``learn`` and ``test`` are row numbers, ``levels`` degrees. Images of one of the (N,) ``groups``, such as

@@ -82,13 +82,9 @@ def angle_deg(a: Float[Tensor, "*n 3"], b: Float[Tensor, "*n 3"]) -> Float[Tenso
 
 
 def geometry_scores(
-    depth_pred: Float[Tensor, "n h w"],
-    mask_pred: Bool[Tensor, "n h w"],
-    depth_true: Float[Tensor, "n h w"],
-    mask_true: Bool[Tensor, "n h w"],
-    fov_deg: float,
-    normal_true: Float[Tensor, "n h w 3"] | None = None,
-) -> GeometryScores:
+    depth_pred: Float[Tensor, "n h w"], mask_pred: Bool[Tensor, "n h w"], depth_true: Float[Tensor, "n h w"],
+    mask_true: Bool[Tensor, "n h w"], fov_deg: float, normal_true: Float[Tensor, "n h w 3"] | None = None,
+) -> GeometryScores:  # fmt: skip
     """SIDE and MAD of depth maps in the view of the image.
 
     ``depth_pred`` is metric or up to scale, and does not matter where ``mask_pred`` is not; ``depth_true`` is
@@ -139,13 +135,9 @@ def predicted_depth(
 
 
 def evaluate_geometry(
-    model: Any,
-    truth: GroundTruth,
-    *,
-    batch_size: int = 64,
-    untrained: Any = None,
+    model: Any, truth: GroundTruth, *, batch_size: int = 64, untrained: Any = None,
     progress: Progress | None = None,
-) -> GeometryResult:
+) -> GeometryResult:  # fmt: skip
     """A model's geometry on images with ground truth, beside average depth, plane and an untrained model.
 
     ``model`` has ``decompose``, ``render``, ``fov_deg``, ``image_size`` and ``device``; ``truth`` is at its
@@ -216,12 +208,9 @@ class FactorResult(ImageResult):
 
 
 def albedo_error(
-    albedo_pred: Float[Tensor, "n 3 h w"],
-    albedo_true: Float[Tensor, "n 3 h w"],
-    mask: Bool[Tensor, "n h w"],
-    *,
-    one_scale: bool = False,
-) -> Float[Tensor, " n"]:
+    albedo_pred: Float[Tensor, "n 3 h w"], albedo_true: Float[Tensor, "n 3 h w"], mask: Bool[Tensor, "n h w"],
+    *, one_scale: bool = False,
+) -> Float[Tensor, " n"]:  # fmt: skip
     """Root mean square albedo error after the best scale, per image; 0 and up, best 0; NaN in an empty mask.
 
     One scale for the three channels, so a colour cast costs. The scale is each image's own, and the error at
@@ -238,13 +227,9 @@ def albedo_error(
 
 
 def light_error(
-    light_pred: Float[Tensor, "n 4"],
-    camera_pred: Float[Tensor, "n 6"],
-    light_true: Float[Tensor, "n 4"],
-    camera_true: Float[Tensor, "n 6"],
-    *,
-    aligned: bool = False,
-) -> AngleScores:
+    light_pred: Float[Tensor, "n 4"], camera_pred: Float[Tensor, "n 6"], light_true: Float[Tensor, "n 4"],
+    camera_true: Float[Tensor, "n 6"], *, aligned: bool = False,
+) -> AngleScores:  # fmt: skip
     """Angle between the directions in which light travels, in the camera's frame; 0..180 degrees, best 0.
 
     With ``aligned``, after the one rotation of all predicted directions that fits the true ones best (least

@@ -193,15 +193,9 @@ class Similarity:
 
 
 def sanity_check(
-    model: Any,
-    probe: Probe,
-    shuffled: Probe,
-    images: Tensor,
-    targets: np.ndarray,
-    *,
-    methods: Sequence[str] = METHODS,
-    seeds: Sequence[int] = (0, 1, 2),
-) -> list[Similarity]:
+    model: Any, probe: Probe, shuffled: Probe, images: Tensor, targets: np.ndarray, *,
+    methods: Sequence[str] = METHODS, seeds: Sequence[int] = (0, 1, 2),
+) -> list[Similarity]:  # fmt: skip
     """Compare the maps of a model with those of fresh weights (by seed), shuffled labels, another image.
 
     ``probe`` is explained, ``shuffled`` learned shuffled labels. Two ``images`` or more are in 0..1,

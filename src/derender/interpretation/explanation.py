@@ -71,28 +71,13 @@ class Explained:
 
 
 def explain(
-    images: ImageSet | str | Path,
-    model: Any = "faces-64",
-    labels: str | Sequence[str] = (),
-    *,
-    bins: int | None = None,
-    min_count: int = 2,
-    dataset: str = "auto",
-    limit: int | None = None,
-    part: str = "all",
-    seeds: int = 3,
-    count: int | None = None,
-    groups: str | None = None,
-    head: str = "logistic",
-    output: str = "logit",
-    baseline: str = "zero",
-    clusters: int | None = None,
-    pair: tuple[str, str] | None = None,
-    batch_size: int = 256,
-    seed: int = 0,
-    device: str = "auto",
+    images: ImageSet | str | Path, model: Any = "faces-64", labels: str | Sequence[str] = (), *,
+    bins: int | None = None, min_count: int = 2, dataset: str = "auto", limit: int | None = None,
+    part: str = "all", seeds: int = 3, count: int | None = None, groups: str | None = None,
+    head: str = "logistic", output: str = "logit", baseline: str = "zero", clusters: int | None = None,
+    pair: tuple[str, str] | None = None, batch_size: int = 256, seed: int = 0, device: str = "auto",
     progress: Callable[[str], Callable[[int, int], object]] = lambda _: lambda _done, _total: None,
-) -> Explained:
+) -> Explained:  # fmt: skip
     """Which factor of a model answers a question about images: shares of integrated gradients, with controls.
 
     Args:
@@ -161,17 +146,10 @@ def split_rows(
 
 
 def explain_labels(
-    features: tables.Features,
-    task: Task,
-    split: Rows,
-    *,
-    untrained: Sequence[tables.Features] = (),
-    seeds: Sequence[int] = (0, 1, 2),
-    head: str = "logistic",
-    output: str = "logit",
-    baseline: str = "zero",
+    features: tables.Features, task: Task, split: Rows, *, untrained: Sequence[tables.Features] = (),
+    seeds: Sequence[int] = (0, 1, 2), head: str = "logistic", output: str = "logit", baseline: str = "zero",
     progress: Callable[[int, int], object] | None = None,
-) -> tables.Explanation:
+) -> tables.Explanation:  # fmt: skip
     """Shares of each factor, (N, D_f) by name, in the answers to a task, with controls.
 
     ``split`` has one number of training rows and S choices, for the S ``seeds`` of probes and shuffled

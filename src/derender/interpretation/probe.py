@@ -34,13 +34,9 @@ WEIGHTS_FILE, CONFIG_FILE = "probe.safetensors", "probe.json"
 
 
 def question(
-    labels: Mapping[str, np.ndarray],
-    names: Sequence[str],
-    *,
-    bins: int | None = None,
-    min_count: int = 2,
+    labels: Mapping[str, np.ndarray], names: Sequence[str], *, bins: int | None = None, min_count: int = 2,
     source: str = "the data",
-) -> Task:
+) -> Task:  # fmt: skip
     """Label columns as a task: one column of any kind, or several of two values each.
 
     Args:
@@ -192,14 +188,9 @@ def load_probe(folder: str | Path) -> Probe:
 
 
 def fit_probe(
-    features: Mapping[str, np.ndarray],
-    task: Task,
-    rows: np.ndarray,
-    *,
-    head: str = "logistic",
-    seed: int = 0,
-    settings: HeadSettings = PAPER_HEAD,
-) -> Probe:
+    features: Mapping[str, np.ndarray], task: Task, rows: np.ndarray, *, head: str = "logistic",
+    seed: int = 0, settings: HeadSettings = PAPER_HEAD,
+) -> Probe:  # fmt: skip
     """Learn from (n,) rows of finite features by factor, each (N, D_f).
 
     ``head`` is "logistic" or "linear"; the seed is of folds, or of the start and the order of rows;

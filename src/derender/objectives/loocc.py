@@ -31,13 +31,9 @@ def nt_xent(a: Float[Tensor, "n d"], b: Float[Tensor, "n d"], temperature: float
 
 
 def loocc_loss(
-    features: Mapping[str, Float[Tensor, "n _"]],
-    features_again: Mapping[str, Float[Tensor, "n _"]],
-    perturbed: Int64[Tensor, " n"],
-    temperature: float = 0.5,
-    *,
-    joint: bool = False,
-) -> Float[Tensor, ""]:
+    features: Mapping[str, Float[Tensor, "n _"]], features_again: Mapping[str, Float[Tensor, "n _"]],
+    perturbed: Int64[Tensor, " n"], temperature: float = 0.5, *, joint: bool = False,
+) -> Float[Tensor, ""]:  # fmt: skip
     """NT-Xent between both encodings of every factor that was not perturbed, mean over what was contrasted.
 
     With ``joint`` of one code, the unperturbed factors' side by side (Eq. 6), mean over images.

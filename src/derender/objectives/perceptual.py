@@ -24,11 +24,9 @@ WHERE_TO_GET_IT = f"save {WEIGHTS} in torch hub's cache, or anywhere and give it
 
 
 def perceptual_loss(
-    prediction: Float[Tensor, "n c fh fw"],
-    target: Float[Tensor, "n c fh fw"],
-    mask: Mask,
+    prediction: Float[Tensor, "n c fh fw"], target: Float[Tensor, "n c fh fw"], mask: Mask,
     sigma: Float[Tensor, "n 1 sh sw"] | None,
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """``|df|^2 / (2 sigma^2) + log sigma`` with |df|^2 averaged over channels, weighted by the mask's share.
 
     The mask is average-pooled to the features' resolution. Without sigma it is the plain mean of |df|^2 (not

@@ -16,11 +16,9 @@ Mask = Float[Tensor, "n h w"] | Bool[Tensor, "n h w"]
 
 
 def photometric_loss(
-    prediction: Float[Tensor, "n c h w"],
-    target: Float[Tensor, "n c h w"],
-    mask: Mask,
+    prediction: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Mask,
     sigma: Float[Tensor, "n 1 h w"] | None,
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, ""]:  # fmt: skip
     """Negative log-likelihood of a Laplace distribution around the prediction, averaged over the mask.
 
     ``sqrt(2) |dI| / sigma + log sigma`` with |dI| averaged over the channels. The best sigma is sqrt(2) |dI|,

@@ -102,13 +102,9 @@ class SelfTraining:
 
 @torch.random.fork_rng(devices=[])  # building layers draws from the global state
 def train_self_features(
-    images: UInt8[Tensor, "n 3 h w"],
-    *,
-    seed: int,
-    steps: int,
-    progress: Callable[[int, int, float], None] | None = None,
-    settings: SelfTraining = SelfTraining(),
-) -> SelfFeatures:
+    images: UInt8[Tensor, "n 3 h w"], *, seed: int, steps: int,
+    progress: Callable[[int, int, float], None] | None = None, settings: SelfTraining = SelfTraining(),
+) -> SelfFeatures:  # fmt: skip
     """Train on these images and freeze; ``progress(step, steps, loss)`` is called after every step.
 
     Calibrated on 256 of the images. The same seed gives the same weights on the same machine and thread
@@ -154,16 +150,9 @@ def train_self_features(
 
 
 def one_cycle(
-    optimiser: torch.optim.Optimizer,
-    loss: Callable[[Int64[Tensor, " b"]], Float[Tensor, ""]],
-    count: int,
-    batch: int,
-    steps: int,
-    generator: Generator,
-    *,
-    warm_up: float,
-    clipped: Sequence[nn.Module] = (),
-) -> Iterator[tuple[int, Float[Tensor, ""]]]:
+    optimiser: torch.optim.Optimizer, loss: Callable[[Int64[Tensor, " b"]], Float[Tensor, ""]], count: int,
+    batch: int, steps: int, generator: Generator, *, warm_up: float, clipped: Sequence[nn.Module] = (),
+) -> Iterator[tuple[int, Float[Tensor, ""]]]:  # fmt: skip
     """Minimise a loss of rows of ``count`` images, drawn epoch by epoch, with one cycle of the rate.
 
     Gives the number of steps done and the loss after each. The optimiser's own rate is the peak, reached

@@ -214,7 +214,7 @@ class PhotoDetail:
             beyond = _veiled(clear, veil) - _veiled(kept, veil)
         edited, (lit, moved) = (kept * ratio).clamp(DARKEST, 1).log(), doubts.split(1, dim=1)
         wrong = drawn.log() - edited
-        surface = edited + torch.lerp(lit * _smooth(wrong, lit, DETAIL_SHARE * self.size), wrong, moved)
+        surface = edited + torch.lerp(lit * smooth(wrong, lit, DETAIL_SHARE * self.size), wrong, moved)
         return _veiled(surface.clamp(max=0).exp(), new) + beyond
 
     def _enlarged(self, *fields: Tensor, part: tuple[Any, ...] = (...,)) -> tuple[Tensor, ...]:
@@ -341,7 +341,7 @@ def _blurred(maps: Tensor, reach: float) -> Tensor:
     return interpolate(_averaged(_small(maps), max(1, round(reach / 4))), maps.shape[-2:], mode="bilinear")
 
 
-def _smooth(maps: Tensor, weight: Float[Tensor, "n 1 h w"], reach: float) -> Tensor:
+def smooth(maps: Tensor, weight: Float[Tensor, "n 1 h w"], reach: float) -> Tensor:
     """The weighted mean around each pixel, as ``_blurred``."""
     known = _small(weight)
     sums = _averaged(torch.cat((known * _small(maps), known), dim=1), max(1, round(reach / 4)))

@@ -22,7 +22,7 @@ from torch import Tensor
 from derender.data import GivenImages, as_photos
 from derender.inputs import as_model
 from derender.model import Derenderer
-from derender.photo.detail import PhotoDetail
+from derender.photo.detail import PhotoDetail, smooth
 from derender.photo.faces import PROFILE_DEG, UTKFACE, face_candidates, frame_of, template_of
 from derender.photo.frame import Frame, Pixels, resized
 from derender.render import Rendering
@@ -33,6 +33,7 @@ from derender.storage.places import require_known
 AMBIENT_SHARE = 0.35  # of a light's strength; the rest is diffuse
 FIT_STEPS = 10  # that optimise a scene before edits, if the model can; with more, new light fits heads less
 LARGEST_CROP = 1024  # side of the largest crop drawn pixel by pixel; of larger ones the change is enlarged
+BEYOND_SHARE, BLUR_SHARE = 0.03, 0.08  # from so far outside a photograph on its border is blurred; its reach
 MARGIN = 0.35  # how far edits reach beyond the frame, in shares of its side
 FRAMES = ("face", "auto", "none")  # ways to find the part of a photograph that a model is given
 
@@ -63,7 +64,12 @@ class Photograph:
         photo = torch.from_numpy(wide.cut(pixels, size)).to(scene.depth.device).float() / 255
         with torch.inference_mode():
             margin = (wide.side / frame.side - 1) / 2
-            visible = wide.visible(pixels.shape[1], pixels.shape[0], size)
+            width, height = pixels.shape[1], pixels.shape[0]
+            beyond = wide.beyond(width, height, size).to(photo)[None, None]
+            if bool(beyond.any()):  # what the border cuts off would leave a streak
+                border = smooth(photo[None], (beyond > 0).to(photo), BLUR_SHARE * size)
+                photo = torch.lerp(photo, border[0], (beyond[0] / BEYOND_SHARE).clamp(max=1))
+            visible = wide.visible(width, height, size)
             detail = PhotoDetail(photo, scene, model.fov_deg, margin, model.renderer, visible)
         return cls(pixels, frame, wide, scene, detail)
 

@@ -103,13 +103,18 @@ class Frame:
             image = image.crop((first, first, first + size, first + size))
         return np.ascontiguousarray(np.asarray(image).transpose(2, 0, 1))
 
+    def beyond(self, width: int, height: int, size: int) -> Float[Tensor, "size size"]:
+        """How far each pixel of the part at ``size`` x ``size`` lies outside the photograph, in its sides."""
+        c, s = cos(radians(self.roll_deg)), sin(radians(self.roll_deg))
+        along = ((torch.arange(size) + 0.5) / size - 0.5) * self.side
+        x, y = self.x + c * along - s * along[:, None], self.y + s * along + c * along[:, None]
+        outside = torch.maximum((x - width / 2).abs() - width / 2, (y - height / 2).abs() - height / 2)
+        return outside.clamp(min=0) / self.side
+
     def paste(
-        self,
-        photo: Pixels,
-        before: Float[Tensor, "3 s s"],
-        after: Float[Tensor, "3 s s"],
+        self, photo: Pixels, before: Float[Tensor, "3 s s"], after: Float[Tensor, "3 s s"],
         moved: bool = False,
-    ) -> Pixels:
+    ) -> Pixels:  # fmt: skip
         """The photograph with an edited crop (0..1): what changed is added, so the rest keeps its pixels.
 
         Detail finer than the crop stays where it is; where things ``moved``, it goes with what is changed.

@@ -87,11 +87,9 @@ class Decomposition:
 
 
 def decomposition(
-    model: Derenderer,
-    images: Float[Tensor, "n 3 h w"],
-    scene: Scene,
+    model: Derenderer, images: Float[Tensor, "n 3 h w"], scene: Scene,
     depth_range: tuple[float, float] | None = None,
-) -> Decomposition:
+) -> Decomposition:  # fmt: skip
     """Draw the scenes of ``images`` (0..1), as the model's renderer does.
 
     ``depth_range`` is the nearest and farthest depth of the colour scale; by default that of these scenes.

@@ -91,11 +91,9 @@ class Mesh:
 
 
 def model_mesh(
-    model: Derenderer,
-    scene: Scene,
-    grazing_deg: float = GRAZING_DEG,
+    model: Derenderer, scene: Scene, grazing_deg: float = GRAZING_DEG,
     texture: Float[Tensor, "1 3 t t"] | None = None,
-) -> Mesh:
+) -> Mesh:  # fmt: skip
     """The mesh of one scene of a model, enlarged or not, without the border held at one depth.
 
     Enlarging smooths the step at that border over one more of the model's columns. ``texture`` takes the

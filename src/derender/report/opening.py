@@ -85,15 +85,9 @@ class ImageOpener:
     """
 
     def __init__(
-        self,
-        model: Derenderer,
-        options: ImageOptions | None = None,
-        *,
-        default_size: int = 0,
-        default_detail: str = "photo",
-        whole: bool = False,
-        held_out: HeldOutErrors | None = None,
-    ):
+        self, model: Derenderer, options: ImageOptions | None = None, *, default_size: int = 0,
+        default_detail: str = "photo", whole: bool = False, held_out: HeldOutErrors | None = None,
+    ):  # fmt: skip
         self.model, self.options, self.held_out = model, options or ImageOptions(), held_out
         self.size = self.options.size or max(default_size, model.image_size)
         self.detail = self.options.detail or default_detail

@@ -33,37 +33,27 @@ SHEET = GridLayout(cell=128)  # of sheets with a row for each image
 
 
 def labelled_grid(
-    columns: Mapping[str, Images],
-    row_labels: Sequence[str] | None = None,
-    title: str = "",
+    columns: Mapping[str, Images], row_labels: Sequence[str] | None = None, title: str = "",
     layout: GridLayout | None = None,
-) -> Image.Image:
+) -> Image.Image:  # fmt: skip
     """One row per image, one column per entry of ``columns`` under its name; row labels at the left."""
     cells = [list(row) for row in zip(*columns.values(), strict=True)]
     return _grid(cells, layout or GridLayout(), title, heads=list(columns), labels=row_labels or [])
 
 
 def contact_sheet(
-    images: Images,
-    captions: Sequence[str] | None = None,
-    across: int = 8,
-    title: str = "",
+    images: Images, captions: Sequence[str] | None = None, across: int = 8, title: str = "",
     layout: GridLayout | None = None,
-) -> Image.Image:
+) -> Image.Image:  # fmt: skip
     """Many images in reading order, ``across`` a row, each with its caption below."""
     rows = [images[start : start + across] for start in range(0, len(images), across)]
     return _grid(rows, layout or GridLayout(cell=96, gap=6, label=13), title, captions=captions or [])
 
 
 def _grid(
-    rows: Sequence[Images],
-    layout: GridLayout,
-    title: str,
-    *,
-    heads: Sequence[str] = (),
-    labels: Sequence[str] = (),
-    captions: Sequence[str] = (),
-) -> Image.Image:
+    rows: Sequence[Images], layout: GridLayout, title: str, *, heads: Sequence[str] = (),
+    labels: Sequence[str] = (), captions: Sequence[str] = (),
+) -> Image.Image:  # fmt: skip
     """Images in rows with heads over columns, labels at the left of rows, and captions in reading order."""
     font, line = ImageFont.load_default(layout.label), layout.label + layout.gap
     left, step = layout.margin, layout.cell + layout.gap

@@ -32,13 +32,9 @@ from derender.storage.atomic import write_whole
 
 
 def comparison_page(
-    title: str,
-    tables: Sequence[ScoreTable],
-    *,
-    lead: str,
-    facts: Mapping[str, object],
+    title: str, tables: Sequence[ScoreTable], *, lead: str, facts: Mapping[str, object],
     failed: Sequence[str] = (),
-) -> Page:
+) -> Page:  # fmt: skip
     """A self-contained page with the tables in reading order, one or two sentences (``lead``) over them.
 
     ``facts`` are models, data, seeds, settings; ``failed`` has a sentence for whatever is missing, with the
@@ -120,12 +116,9 @@ def overlays(pictures: np.ndarray, masks: np.ndarray, n_classes: int, *, scale: 
 
 
 def segmentation_sheet(
-    pictures: np.ndarray,
-    masks: np.ndarray,
-    answers: Mapping[str, np.ndarray],
-    classes: Sequence[str],
+    pictures: np.ndarray, masks: np.ndarray, answers: Mapping[str, np.ndarray], classes: Sequence[str],
     layout: GridLayout | None = None,
-) -> Image.Image:
+) -> Image.Image:  # fmt: skip
     """A row for each image (N, 3, S, S) uint8: itself, its true mask (N, S, S), every answer by name.
 
     The legend of the classes, named by number, is below.

@@ -162,16 +162,10 @@ def _finite_rows(metrics: Metrics, name: str, kind: str | None = None) -> Metric
 
 
 def run_evidence(
-    run: str | Path,
-    images: ImageSet | str | Path,
-    *,
-    truth: str | Path | None = None,
-    labels: Sequence[str] = (),
-    dataset: str = "auto",
-    limit: int | None = None,
-    device: str = "auto",
+    run: str | Path, images: ImageSet | str | Path, *, truth: str | Path | None = None,
+    labels: Sequence[str] = (), dataset: str = "auto", limit: int | None = None, device: str = "auto",
     progress: Progress | None = None,
-) -> Evidence:
+) -> Evidence:  # fmt: skip
     """Everything that can be reported of a run's model and images.
 
     A run without a model (a baseline, a collapse, a run that has just begun) has only its images examined.

@@ -116,12 +116,9 @@ def true_factors(labels: Mapping[str, np.ndarray]) -> tuple[list[TrueFactor], di
 
 
 def ground_truth_scores(
-    blocks: Mapping[str, np.ndarray],
-    factors: Sequence[TrueFactor],
-    *,
-    dimensions: str | None = None,
+    blocks: Mapping[str, np.ndarray], factors: Sequence[TrueFactor], *, dimensions: str | None = None,
     seed: int = 0,
-) -> GroundTruthScores:
+) -> GroundTruthScores:  # fmt: skip
     """All scores of features by name, each (N, D), against two true factors or more of the same N images.
 
     ``dimensions`` is the method of the importances of single dimensions, "lasso"; None leaves their scores

@@ -44,17 +44,10 @@ PAGE_FILES = {"index.html": "html", "view.css": "css", "view.js": "javascript", 
 
 
 def open_viewer(
-    model: Derenderer,
-    source: str,
-    images: Sequence[Path] = (),
-    *,
-    table: FeatureTable | None = None,
-    data: str | None = None,
-    dataset: str = "auto",
-    keep: int = KEPT,
-    fit_steps: int | None = None,
+    model: Derenderer, source: str, images: Sequence[Path] = (), *, table: FeatureTable | None = None,
+    data: str | None = None, dataset: str = "auto", keep: int = KEPT, fit_steps: int | None = None,
     frame: str | None = None,
-) -> tuple[Studio, list[str]]:
+) -> tuple[Studio, list[str]]:  # fmt: skip
     """A model with images to begin with and rows to search, and notes on what is missing.
 
     Args:
