@@ -289,7 +289,8 @@ class ImageFiles:
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("stopped; finished images are kept: --resume continues") from None
         notice(*written.notes())
-        output.result(f"{places.counted(len(written.images), 'images')} in {self.out}")
+        count = places.counted(len(written.images), "images")
+        output.result(f"wrote {self.out}" if self.suffix and written.images else f"{count} in {self.out}")
         output.write(written.values())
         if set(written.refused) & set(self.images):  # of a folder others were used
             raise typer.Exit(2)
