@@ -93,6 +93,7 @@ published: $(STAMP)  ## repeat results on LFW, UTKFace, CelebA and Yale B: make 
 	  "celeba-labels evaluate linear $(IMAGES)/celeba64.zip --model faces-64 --attributes --heads linear,centred,logistic --resamples 200 --seeds 1" \
 	  "robustness-lfw evaluate robustness $(IMAGES)/lfw64.zip --model faces-64 --pictures render $(LFW)" \
 	  "identity evaluate identify $(IMAGES)/yaleb.zip --model faces-64 --half test" \
+	  "identity-all evaluate identify $(IMAGES)/yaleb.zip --model faces-64" \
 	  "identity-128 evaluate identify $(IMAGES)/yaleb.zip --model faces-128 --half test" \
 	  "light evaluate light $(IMAGES)/yaleb.zip --half test --model faces-64" \
 	  "light-optimised evaluate light $(IMAGES)/yaleb.zip --half test --model faces-64 --fit-steps 10" \

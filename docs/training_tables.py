@@ -11,14 +11,17 @@ RUNGS = {
     "r3": "+ cycle term", "r4": "+ stronger LOOCC", "r5": "+ whitening", "r6": "+ distillation",
     "r7": "+ 60 steps per image",
 }  # fmt: skip
-LADDER_CONTROLS = {"generated/people.json": "nmi", "published/lfw.json": "nmi"}
-LADDER_DEPTH = {"average depth": "average depth", "untrained encoder": "untrained model"}
+LADDER_CONTROLS = {
+    "generated/people.json": "nmi", "published/lfw.json": "nmi", "published/identity-all.json": "<= 50",
+}  # fmt: skip
+LADDER_DEPTH = {"PCA (64)": "average depth", "untrained encoder": "untrained model"}
 
 
 def ladder(result: Any) -> Iterator[list[str]]:
     """Means and deviations over the seeds that did not collapse, then controls."""
-    keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3}
-    yield ["each row adds to the one above", "whole runs", "SIDE x 100", "tracks, NMI", "LFW, NMI"]
+    keys = {"SIDE x 100": 2, "tracks nmi": 3, "LFW nmi": 3, "Yale B <= 50": 3}
+    scores = ("SIDE x 100", "tracks, NMI", "LFW, NMI", "Yale B, 25 to 50°")
+    yield ["each row adds to the one above", "whole runs", *scores]
     for rung, name in RUNGS.items():
         seeds = [row for row in result["rows"] if row["rung"] == rung]
         whole = [row for row in seeds if not row["collapsed"]]
@@ -28,12 +31,12 @@ def ladder(result: Any) -> Iterator[list[str]]:
     controls = {file: kept(file)["rows"] for file in LADDER_CONTROLS}
     depth = kept("generated/heads.json")["intervals"]["geometry"]
     side = {name: f"{100 * depth[row]['scores']['side']['value']:.2f}" for name, row in LADDER_DEPTH.items()}
-    yield ["average depth (control)", "", side["average depth"], "", ""]
-    for name in ("untrained encoder", "PCA (64)", "pixels"):
+    for name in ("untrained encoder", "PCA (64)", "pixels", "Gradientfaces"):
         scores = (
             f"{controls[file][name]['scores'][key]['value']:.3f}" for file, key in LADDER_CONTROLS.items()
         )
-        yield [f"{name} (control)", "", side.get(name, ""), *scores]
+        shown = f"average depth; {name}" if name == "PCA (64)" else name
+        yield [f"{shown} (control)", "", side.get(name, ""), *scores]
 
 
 SEEDED = {
@@ -57,3 +60,21 @@ def seeds(result: Any) -> Iterator[list[str]]:
         released = rows["geometry + albedo"]["scores"][key]["value"]
         control = max(row["scores"][key]["value"] for row in rows.values() if row["control"])
         yield [name, spread([row[column] for row in result["rows"]], 3), f"{released:.3f}", f"{control:.3f}"]
+
+
+HEADS = {
+    "depth, SIDE x 100": ("side", 100, 3), "normals, degrees": ("mad_deg", 1, 1),
+    "light, degrees": ("light", 1, 1), "camera, degrees": ("camera", 1, 1), "albedo": ("albedo", 1, 3),
+    "12 people, accuracy": ("accuracy", 1, 3),
+}  # fmt: skip
+
+
+def seeds_of_heads(result: Any) -> Iterator[list[str]]:
+    """As `seeds`, of rendered heads of two families; what is released and controls are in the same file."""
+    yield ["", f"{len(result['rows'])} seeds", "`rendered-faces-64`", "best control"]
+    for name, (key, scale, digits) in HEADS.items():
+        for family in ("generated", "morphable"):
+            column = f"{family} {key}"
+            one, control = (f"{scale * result[part][column]:.{digits}f}" for part in ("released", "controls"))
+            values = [scale * row[column] for row in result["rows"]]
+            yield [f"{family} heads: {name}", spread(values, digits), one, control]
