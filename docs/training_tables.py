@@ -60,21 +60,3 @@ def seeds(result: Any) -> Iterator[list[str]]:
         released = rows["geometry + albedo"]["scores"][key]["value"]
         control = max(row["scores"][key]["value"] for row in rows.values() if row["control"])
         yield [name, spread([row[column] for row in result["rows"]], 3), f"{released:.3f}", f"{control:.3f}"]
-
-
-HEADS = {
-    "depth, SIDE x 100": ("side", 100, 3), "normals, degrees": ("mad_deg", 1, 1),
-    "light, degrees": ("light", 1, 1), "camera, degrees": ("camera", 1, 1), "albedo": ("albedo", 1, 3),
-    "12 people, accuracy": ("accuracy", 1, 3),
-}  # fmt: skip
-
-
-def seeds_of_heads(result: Any) -> Iterator[list[str]]:
-    """As `seeds`, of rendered heads of two families; what is released and controls are in the same file."""
-    yield ["", f"{len(result['rows'])} seeds", "`rendered-faces-64`", "best control"]
-    for name, (key, scale, digits) in HEADS.items():
-        for family in ("generated", "morphable"):
-            column = f"{family} {key}"
-            one, control = (f"{scale * result[part][column]:.{digits}f}" for part in ("released", "controls"))
-            values = [scale * row[column] for row in result["rows"]]
-            yield [f"{family} heads: {name}", spread(values, digits), one, control]

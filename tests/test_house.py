@@ -32,7 +32,7 @@ BUDGET = {  # lines, files
     "learn": (897, 5),
 }
 TOTAL = (36_716, 233)
-TEST_LINES = 26_000
+TEST_LINES = 25_997
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80
 SHARED_BY_COMMANDS = {"__init__.py", "console.py", "options.py", "scoring.py"}

@@ -44,8 +44,7 @@ def test_what_is_visible_of_a_part_holds_all_that_shows_the_photograph(frame):
     around = np.pad(white, ((200, 200), (200, 200), (0, 0)))  # black
     hidden = Frame(frame.x + 200, frame.y + 200, frame.side, frame.roll_deg).cut(around, 60)
     assert hidden.max() == 255
-    outside = frame.beyond(60, 40, 60).numpy()
-    assert (outside[hidden[0] == 255] == 0).all() and (hidden[0, outside > 2 / 60] < 128).all()
+    assert hidden[0, frame.beyond(60, 40, 60).numpy() > 2 / 60].max() < 128
     rows, columns = frame.visible(60, 40, 60)
     hidden[:, rows, columns] = 0
     assert hidden.max() == 0
