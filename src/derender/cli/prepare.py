@@ -20,7 +20,7 @@ def align(
     size: int = option(256, "Side of the crops in pixels.", min=8, max=4096),
     margin: float = option(0.0, "More surroundings on every side, in shares of the side.", min=0, max=2),
     largest: bool = option(False, "Only the largest face of each photograph.", "--largest"),
-    keep: bool = option(False, "Of photographs without a face, keep the middle square.", "--keep"),
+    keep: bool = option(False, "Keep the middle square of photographs without a face.", "--keep"),
 ) -> None:
     """Find every face of photographs, and write it upright and centred, as models of faces take it.
 

@@ -37,7 +37,7 @@ _DAMPING = 0.02  # of the steepest direction: flatter ones are taken for as stee
 _TYPICAL = ((0.4, -0.6, -0.15, 0.35), (-0.4, 0.6, 0.15, -0.35))
 """Pitch and yaw of the light and of the camera (radians) where the steepness of the loss is measured."""
 _NEAR = 4.0  # differences that measure it: half a standard deviation, 0.04 radians
-_NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates of 1
+NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates, or a distilled gap, of 1
 _BEYOND = 0.1  # what an error beyond the tolerance still counts
 
 
@@ -238,7 +238,7 @@ class Fitting(nn.Module):
             error = error_of(rendering)
             before = error.detach() if step == 0 else before
             usual = torch.stack([value.square().mean(dim=1) for value in result]).sum(dim=0)
-            loss = (error / _NOISE + self.settings.prior * usual).sum()
+            loss = (error / NOISE + self.settings.prior * usual).sum()
             (gradient,) = torch.autograd.grad(loss, moved)
             with torch.no_grad():
                 # what is at its bound and pulled outwards stays, and moves nothing with it
@@ -274,7 +274,7 @@ class Fitting(nn.Module):
             shown = [render(part) for part in torch.cat([at + near, at - near]).split(32)]
             above, below = torch.cat([part.image for part in shown]).flatten(1).double().chunk(2)
             change, covered = (above - below) / (2 * _NEAR), shown[0].mask[0].sum().clamp(min=1)
-            hessian += change @ change.T / (3 * covered * _NOISE**2 * len(_TYPICAL))
+            hessian += change @ change.T / (3 * covered * NOISE**2 * len(_TYPICAL))
         hessian.diagonal().add_(_DAMPING * torch.linalg.matrix_norm(hessian, 2).clamp(min=1e-6))
         factor = torch.linalg.cholesky(hessian)
         unit = torch.eye(len(rates)).to(hessian)

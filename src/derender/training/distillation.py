@@ -26,7 +26,7 @@ from derender.networks.encoders import Images, Pixels
 from derender.networks.factors import Number
 from derender.objectives.reconstruction import masked_l1
 from derender.objectives.self_features import one_cycle
-from derender.postprocess.fitting import PARAMETERS, STEPS, MorphableMaps
+from derender.postprocess.fitting import NOISE, PARAMETERS, STEPS, MorphableMaps
 from derender.scene import Scene, crop
 from derender.scene.perturb import PerturbSettings
 from derender.scene.scene import seen_in_mirror
@@ -37,8 +37,6 @@ from derender.training.step import fill_uncovered, where_rows
 from derender.training.views import batches
 
 MEASURED_IMAGES = 256  # images on which standard deviations and errors are measured
-
-_NOISE = 0.03  # mean absolute error of a rendering that counts as much as a gap of 1
 
 
 class StudentSettings(Settings):
@@ -189,7 +187,7 @@ def _learn(
         if settings.picture_weight and len(shown[photographs]):
             again = student.render(predicted[photographs])
             error = masked_l1(again.image, shown[photographs], again.mask.detach())
-            total = total + settings.picture_weight * error / _NOISE
+            total = total + settings.picture_weight * error / NOISE
         return total
 
     settings.learn("refining", student, optimiser, loss, len(images), generator, report, warm_up=0.05)
