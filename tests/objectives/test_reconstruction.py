@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from derender.objectives import reconstruction
 from derender.objectives.perceptual import perceptual_loss
-from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss
+from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss, relief
 
 depth_curvature = partial(depth_smoothness, order=2)
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
@@ -130,6 +130,13 @@ def test_depth_penalties_of_known_surfaces():
     assert depth_curvature(ramp + 1).item() == pytest.approx(0, abs=1e-5)
     bowl = (0.01 * rows**2 + 0.02 * columns**2)[None]
     assert depth_curvature(bowl, depth_range=0.2).item() == pytest.approx((0.02 + 0.04) / 0.2, rel=1e-4)
+
+
+def test_relief_is_the_height_of_parabolas_along_columns_and_rows():
+    down, across = torch.linspace(-1, 1, 9)[:, None], torch.linspace(-1, 1, 6)
+    saddle = 1 + 0.03 * down**2 - 0.05 * across**2 + 0.02 * down + 0.01 * across**3
+    clamped = torch.nn.functional.pad(torch.stack([saddle, 2 - saddle]), (2, 2), value=1.04)
+    torch.testing.assert_close(relief(clamped, border=2), torch.tensor([[0.3, -0.5], [-0.3, 0.5]]))
 
 
 @pytest.mark.parametrize(("penalty", "least"), [(depth_smoothness, 2), (depth_curvature, 3)])

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from derender.model import Derenderer
-from derender.objectives.reconstruction import masked_l1, photometric_loss
+from derender.objectives.reconstruction import masked_l1, photometric_loss, relief
 from derender.objectives.self_features import SelfFeatures
 from derender.render import render_scene
 from derender.training.config import ObjectiveSettings, TrainConfig, resolve
@@ -18,8 +18,8 @@ from derender.training.run_folder import RunFolder
 from derender.training.step import cycle_loss, fill_uncovered, own_share, perturb_one_factor, training_step
 from derender.training.task import Step, compute_step
 
-TEMPLATE = ObjectiveSettings(perceptual="none", curvature_weight=0.0, template_share=0.1, release_share=0.2)
-PLAIN = ObjectiveSettings(perceptual="none", curvature_weight=0.0)
+PLAIN = ObjectiveSettings(perceptual="none", curvature_weight=0.0, raised_weight=0.0)
+TEMPLATE = PLAIN.model_copy(update={"template_share": 0.1, "release_share": 0.2})
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_reconstruction_terms_are_the_losses_of_scene_and_twin(model, images, ge
 
 def test_every_weighted_term_appears_only_when_asked_for(model, images, generator):
     asked = {"smoothness": {"smoothness_weight": 0.1}, "curvature": {"curvature_weight": 1.0}}
-    loocc = {"loocc": "light+camera"}
+    loocc, asked["raised"] = {"loocc": "light+camera"}, {"raised_weight": 1.0}
     asked |= {"loocc": loocc, "cycle": {**loocc, "cycle_weight": 1.0}}
     plain = set(training_step(model, images, PLAIN, None, generator).terms)
     assert plain == {"photometric", "photometric_flip", "l1"}
@@ -56,6 +56,21 @@ def test_every_weighted_term_appears_only_when_asked_for(model, images, generato
         terms = training_step(model, images, PLAIN.model_copy(update=change), None, generator).terms
         assert name in terms
         assert terms[name] > 0
+
+
+def test_the_mean_surface_is_raised_along_rows_and_columns_and_then_left_alone(images, generator):
+    model = Derenderer.from_preset("small", seed=0, image_size=32, width=8, light_width=4)
+    objective = PLAIN.model_copy(update={"photometric_weight": 1e-9, "raised_weight": 1.0})
+    optimiser, before = torch.optim.Adam(model.parameters(), lr=3e-3), 0.0
+    for _ in range(30):
+        result = training_step(model, images, objective, None, generator)
+        optimiser.zero_grad()
+        result.total.backward()
+        optimiser.step()
+        before = before or result.terms["raised"].item()
+    missing = (0.1 - relief(result.scene.depth.detach(), border=1).mean(dim=0)).clamp(min=0).sum()
+    assert result.terms["raised"].item() == pytest.approx(missing.item(), abs=1e-6)
+    assert before > 0.1 and missing < 0.02
 
 
 @pytest.mark.parametrize("kind", ["light", "light+camera", "all"])

@@ -137,7 +137,7 @@ def test_perceptual_features(model, images, bad):
 
 def test_a_depth_that_is_no_number_leaves_the_loss_finite_and_is_seen_all_the_same(model, images):
     spoil(model.nets["geometry"].decoder, nan)
-    objective = ObjectiveSettings(perceptual="none", curvature_weight=0, confidence=False)
+    objective = ObjectiveSettings(perceptual="none", curvature_weight=0, raised_weight=0, confidence=False)
     result = training_step(model, images, objective, None, torch.Generator().manual_seed(0))
     (finding,) = seen(Watcher(model.settings.ranges, 4), result)
     assert "the predicted depth" in finding.text

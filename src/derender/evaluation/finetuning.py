@@ -43,8 +43,8 @@ from derender.training.watch import FiniteWatch
 
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
 RENDERING_TERMS = (
-    *("photometric", "photometric_flip", "perceptual", "perceptual_flip", "smoothness", "curvature"),
-    *NOT_RECONSTRUCTION,
+    *("photometric", "photometric_flip", "perceptual", "perceptual_flip"),
+    *("smoothness", "curvature", "raised", *NOT_RECONSTRUCTION),
 )
 
 

@@ -59,6 +59,21 @@ def depth_smoothness(
     return (rows + columns) / depth_range
 
 
+def relief(depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int = 0) -> Float[Tensor, "n 2"]:
+    """How far each map's middle lies before its rim, along columns and along rows, in half depth ranges.
+
+    Those are the heights of the parabolas that fit best; negative where the surface is hollow. ``border``
+    columns at each side are left out.
+    """
+    depth, heights = at_least_float32(depth[:, :, border : depth.shape[2] - border]), []
+    for across in (2, 1):
+        profile = depth.mean(dim=across)
+        bend = torch.linspace(-1, 1, profile.shape[1], device=depth.device, dtype=depth.dtype).square()
+        bend = bend - bend.mean()
+        heights.append(profile @ bend / bend.square().sum())
+    return torch.stack(heights, dim=1) * 2 / depth_range
+
+
 def masked_mean(value: Float[Tensor, "n h w"], weight: Mask) -> Float[Tensor, ""]:
     """Weighted mean over the whole batch; exactly 0, with zero gradient, where every weight is 0."""
     weight = weight.to(value.dtype)

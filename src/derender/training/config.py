@@ -45,6 +45,7 @@ class ObjectiveSettings(Settings):
     perceptual_weight: float = Field(default=1.0, ge=0)  # of the loss on features of the images
     smoothness_weight: float = Field(default=0.0, ge=0)  # on steps of depth, as unsup3d for cars
     curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; 0 in the paper
+    raised_weight: float = Field(default=1.0, ge=0)  # on a mean surface that is hollow; 0 in the paper
     photometric_weight: float = Field(default=1.0, gt=0)  # without confidence 2 is unsup3d's L1 in -1..1
     perceptual_rescaled: bool = True  # VGG16's features by their standard deviation; not in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps

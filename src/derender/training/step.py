@@ -19,7 +19,7 @@ from derender.networks.decoders import Confidence
 from derender.networks.encoders import Images
 from derender.objectives.loocc import loocc_loss
 from derender.objectives.perceptual import PerceptualFeatures, perceptual_loss
-from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss
+from derender.objectives.reconstruction import depth_smoothness, masked_l1, photometric_loss, relief
 from derender.render import Rendering
 from derender.scene import Scene
 from derender.scene.perturb import choose_factors
@@ -29,6 +29,7 @@ from derender.training.task import Precision, StepLosses
 
 Codes = Mapping[str, Float[Tensor, "n _"]]
 Columns = Mapping[str, Shaped[Tensor, "n ..."]]
+RAISED = 0.1  # half depth ranges by which the mean surface is raised at least, along columns and along rows
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,9 @@ def training_step(
     for order, (name, weight) in enumerate(steps.items(), 1):
         if weight > 0:
             terms[name] = finer**order * weight * depth_smoothness(scene.depth, *inside, order)
+    if objective.raised_weight > 0:
+        missing = RAISED - ranks.gather(relief(scene.depth, *inside)).mean(dim=0)
+        terms["raised"] = objective.raised_weight * missing.clamp(min=0).sum()
     if model.renderer.penalty is not None:
         terms["penalty"] = model.renderer.penalty(scene, model.renderer.shading(scene, model.fov_deg))
     if left_out is not None:

@@ -96,19 +96,13 @@ def test_an_objection_needs_certainty():
     check, one_sided = (replace(CHECKS["symmetry"], objects=limit, struggles=0.2) for limit in (0.1, None))
     share = replace(one_sided, noted=0.1)
     for value, error, judge, *expected in (
-        (0.05, 0.01, check, "objection", True),
-        (0.05, 0.04, check, "trouble", False),
-        (0.15, 0.01, check, "trouble", True),
-        (0.15, 0.04, check, "trouble", False),
-        (0.25, 0.04, check, "good", False),
-        (0.25, 0.01, check, "good", True),
-        (0.05, 0.01, one_sided, "trouble", True),
-        (0.3, 0.01, share, "trouble", True),
-        (0.3, 0.06, share, "trouble", False),
-        (0.15, 0.0, share, "note", True),
-        (0.15, 0.03, share, "note", False),
-        (0.05, 0.0, share, "good", True),
-    ):
+        (0.05, 0.01, check, "objection", True), (0.05, 0.04, check, "trouble", False),
+        (0.15, 0.01, check, "trouble", True), (0.15, 0.04, check, "trouble", False),
+        (0.25, 0.04, check, "good", False), (0.25, 0.01, check, "good", True),
+        (0.05, 0.01, one_sided, "trouble", True), (0.3, 0.01, share, "trouble", True),
+        (0.3, 0.06, share, "trouble", False), (0.15, 0.0, share, "note", True),
+        (0.15, 0.03, share, "note", False), (0.05, 0.0, share, "good", True),
+    ):  # fmt: skip
         assert judged(JackknifeEstimate(value, error), judge) == tuple(expected)
 
 
