@@ -63,7 +63,7 @@ def relief(depth: Float[Tensor, "n h w"], depth_range: float = 0.2, border: int 
     """How far each map's middle lies before its rim, along columns and along rows, in half depth ranges.
 
     Those are the heights of the parabolas that fit best; negative where the surface is hollow. ``border``
-    columns at each side are left out.
+    columns at each side are left out. No published source.
     """
     depth, heights = at_least_float32(depth[:, :, border : depth.shape[2] - border]), []
     for across in (2, 1):
