@@ -73,13 +73,9 @@ def test_chance_keeps_cluster_sizes_and_needs_a_seed():
 
 @pytest.mark.parametrize(
     ("labels", "clusters", "message"),
-    [
-        ([], [], "no rows"),
-        (["a", ""], [0, 1], "1 labels are missing"),
-        (["a", "b"], [0, 1, 2], "must be of one length"),
-        ([["a"], ["b"]], [0, 1], "one value per row"),
-    ],
-)
+    [([], [], "no rows"), (["a", ""], [0, 1], "1 labels are missing"),
+     (["a", "b"], [0, 1, 2], "must be of one length"), ([["a"], ["b"]], [0, 1], "one value per row")],
+)  # fmt: skip
 def test_scores_need_rows_labels_and_one_length(labels, clusters, message):
     with pytest.raises(ValueError, match=message):
         cluster_scores(np.array(labels), np.array(clusters))

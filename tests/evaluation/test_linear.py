@@ -49,13 +49,10 @@ def test_two_values_are_asked_yes_or_no_and_more_are_a_choice():
 
 @pytest.mark.parametrize(
     ("labels", "message"),
-    [
-        ({}, "at least one label column"),
-        ({"a": np.ones(4)}, "two classes, the 4 labelled rows of 'a' have 1"),
-        ({"a": np.array(["x", "x", "y"])}, "class 'y' of label 'a' has one row"),
-        ({"a": np.arange(6) % 3, "b": np.arange(6) % 2}, "'a' has 3 classes and cannot be asked together"),
-    ],
-)
+    [({}, "at least one label column"), ({"a": np.ones(4)}, "two classes, the 4 labelled rows of 'a' have 1"),
+     ({"a": np.array(["x", "x", "y"])}, "class 'y' of label 'a' has one row"),
+     ({"a": np.arange(6) % 3, "b": np.arange(6) % 2}, "'a' has 3 classes and cannot be asked together")],
+)  # fmt: skip
 def test_tasks_that_cannot_be_asked(labels, message):
     with pytest.raises(ValueError, match=message):
         task_of(labels)
@@ -86,13 +83,10 @@ def test_the_owners_test_part_and_groups_are_kept():
 
 @pytest.mark.parametrize(
     ("counts", "options", "message"),
-    [
-        ((10, 100), {}, "learn from 10, 100 labelled rows: 80 can be learned from and 80 are tested"),
-        ((), {}, "learn from no labelled rows"),
-        ((10,), {"seeds": ()}, "at least one seed"),
-        ((10,), {"test_fraction": 1.0}, "0 can be learned from and 160 are tested"),
-    ],
-)
+    [((10, 100), {}, "learn from 10, 100 labelled rows: 80 can be learned from and 80 are tested"),
+     ((), {}, "learn from no labelled rows"), ((10,), {"seeds": ()}, "at least one seed"),
+     ((10,), {"test_fraction": 1.0}, "0 can be learned from and 160 are tested")],
+)  # fmt: skip
 def test_rows_that_cannot_be_chosen(counts, options, message):
     with pytest.raises(ValueError, match=message):
         choose_rows(task_of(problem()[1]), files(160), counts, **options)
@@ -274,12 +268,10 @@ def test_features_that_hold_the_labels_are_above_every_control(tmp_path):
 
 @pytest.mark.parametrize(
     ("head", "features", "message"),
-    [
-        ("logistics", np.ones((4, 2)), "unknown head 'logistics'; did you mean 'logistic'"),
-        ("k-NN", np.array([[1.0], [np.inf], [0], [0]]), "not finite in 1 of 4 rows"),
-        ("logistic", np.ones((4, 2)), "2 rows cannot be cut into 5 folds"),
-    ],
-)
+    [("logistics", np.ones((4, 2)), "unknown head 'logistics'; did you mean 'logistic'"),
+     ("k-NN", np.array([[1.0], [np.inf], [0], [0]]), "not finite in 1 of 4 rows"),
+     ("logistic", np.ones((4, 2)), "2 rows cannot be cut into 5 folds")],
+)  # fmt: skip
 def test_probes_refuse_bad_input_in_words(head, features, message):
     task = Task("labels", ("a",), np.array([[0], [1], [0], [1]], np.int8))
     with pytest.raises(ValueError, match=message):

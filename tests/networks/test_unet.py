@@ -75,13 +75,10 @@ def hangs_on_the_batch(encoder: UNetEncoder) -> list[bool]:
 
 @pytest.mark.parametrize(
     ("how", "still"),
-    [
-        ({}, ("to_code",)),
-        ({"frozen": True}, ("",)),  # every tensor
-        ({"kept_statistics": True}, ("running", "num_batches", "to_code")),
-    ],
+    [({}, ("to_code",)), ({"frozen": True}, ("",)),  # every tensor
+     ({"kept_statistics": True}, ("running", "num_batches", "to_code"))],
     ids=["all learn", "frozen encoders", "statistics are kept while weights learn"],
-)
+)  # fmt: skip
 def test_encoders_learn_or_stay_as_asked_for_while_the_decoder_learns(how, still):
     net = SegmentationNet([encoder(0)], CLASSES, **how).train()
     assert hangs_on_the_batch(net.encoders[0]) == 4 * [not how]

@@ -73,6 +73,17 @@ def test_the_mean_surface_is_raised_along_rows_and_columns_and_then_left_alone(i
     assert before > 0.1 and missing < 0.02
 
 
+def test_leaning_objects_are_seen_from_their_lean_on_average(model, images, generator):
+    ranges = model.settings.ranges.model_copy(update={"lean_deg": 35.0})
+    leaning = Derenderer.seeded(model.settings.model_copy(update={"ranges": ranges}), 0)
+    result = training_step(leaning, images, PLAIN, None, generator)
+    pitch = leaning.decompose(images).camera[:, 0].detach()
+    products = (pitch[:, None] * pitch)[~torch.eye(6, dtype=torch.bool)]
+    torch.testing.assert_close(result.terms["lean"], 10 * products.mean())
+    unweighted = PLAIN.model_copy(update={"lean_weight": 0.0})
+    assert "lean" not in training_step(leaning, images, unweighted, None, generator).terms
+
+
 @pytest.mark.parametrize("kind", ["light", "light+camera", "all"])
 def test_exactly_the_chosen_factor_of_each_picture_is_changed(model, images, kind, generator):
     objective = ObjectiveSettings(loocc=kind)
@@ -138,6 +149,10 @@ def test_a_shared_template_leaves_cameras_and_lights_their_own(model, images, ge
     torch.testing.assert_close(scene.camera, apart.camera)
     torch.testing.assert_close(scene.light, apart.light)
     assert not torch.allclose(apart.albedo[0], apart.albedo[1])
+    shape = TEMPLATE.model_copy(update={"template_albedo": False})
+    only_shape = training_step(model, images, shape, None, generator, own=0.0).scene
+    torch.testing.assert_close(only_shape.depth, scene.depth)
+    torch.testing.assert_close(only_shape.albedo, apart.albedo)
 
 
 def test_the_step_follows_the_run_and_validation_does_not(model, images, generator):

@@ -44,7 +44,7 @@ from derender.training.watch import FiniteWatch
 HEAD_FILE, HEAD_CONFIG_FILE = "head.safetensors", "head.json"
 RENDERING_TERMS = (
     *("photometric", "photometric_flip", "perceptual", "perceptual_flip"),
-    *("smoothness", "curvature", "raised", *NOT_RECONSTRUCTION),
+    *("smoothness", "curvature", "raised", "lean", *NOT_RECONSTRUCTION),
 )
 
 

@@ -46,6 +46,7 @@ class ObjectiveSettings(Settings):
     smoothness_weight: float = Field(default=0.0, ge=0)  # on steps of depth, as unsup3d for cars
     curvature_weight: float = Field(default=3.0, ge=0)  # on second differences of depth; 0 in the paper
     raised_weight: float = Field(default=1.0, ge=0)  # on a mean surface that is hollow; 0 in the paper
+    lean_weight: float = Field(default=10.0, ge=0)  # on a mean view from above by another angle than lean_deg
     photometric_weight: float = Field(default=1.0, gt=0)  # without confidence 2 is unsup3d's L1 in -1..1
     perceptual_rescaled: bool = True  # VGG16's features by their standard deviation; not in the paper
     vgg16_path: str | None = None  # None: the file torch hub keeps
@@ -56,6 +57,7 @@ class ObjectiveSettings(Settings):
     loocc_temperature: float = Field(default=0.5, gt=0)  # of cosines in LOOCC (NT-Xent)
     cycle_weight: float = Field(default=0.0, ge=0)  # light and camera predicted from LOOCC's renderings
     template_share: float = Field(default=0.0, ge=0, le=1)  # of the run: all share one shape and albedo
+    template_albedo: bool = True  # False: only the shape is shared, for objects of many colours
     release_share: float = Field(default=0.0, ge=0, le=1)  # of the run: each gets its own gradually
     perturb: PerturbSettings = PerturbSettings()
 

@@ -74,7 +74,8 @@ def training_step(
 
     with precision():
         codes = in_chunks(encode, {"images": images}, chunks)
-        shared = share_codes(codes, [f.name for f in model.factors if f.mirrored], own, ranks)
+        alike = [f.name for f in model.factors if f.mirrored]
+        shared = share_codes(codes, alike if objective.template_albedo else ["geometry"], own, ranks)
         values = in_chunks(lambda rows: model.decode(dict(rows)).parameters, shared, chunks)
         sigmas = in_chunks(confidence, {"images": images}, chunks) if objective.confidence else {}
         scene = Scene.from_parameters(values)
@@ -110,6 +111,10 @@ def training_step(
     if objective.raised_weight > 0:
         missing = RAISED - ranks.gather(relief(scene.depth, *inside)).mean(dim=0)
         terms["raised"] = objective.raised_weight * missing.clamp(min=0).sum()
+    if ranges.lean_deg and objective.lean_weight > 0:
+        pitch = ranks.gather(scene.camera[:, 0])
+        pairs = pitch.sum().square() - pitch.square().sum()  # the square of the mean would shrink the spread
+        terms["lean"] = objective.lean_weight * pairs / max(len(pitch) * (len(pitch) - 1), 1)
     if model.renderer.penalty is not None:
         terms["penalty"] = model.renderer.penalty(scene, model.renderer.shading(scene, model.fov_deg))
     if left_out is not None:
