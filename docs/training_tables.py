@@ -60,3 +60,22 @@ def seeds(result: Any) -> Iterator[list[str]]:
         released = rows["geometry + albedo"]["scores"][key]["value"]
         control = max(row["scores"][key]["value"] for row in rows.values() if row["control"])
         yield [name, spread([row[column] for row in result["rows"]], 3), f"{released:.3f}", f"{control:.3f}"]
+
+
+RENDERED = {
+    "side": ("SIDE x 100", 100, 3), "mad_deg": ("normals, degrees", 1, 1), "albedo": ("albedo", 1, 3),
+    "light": ("lighting, degrees", 1, 1), "camera": ("viewpoint, degrees", 1, 1),
+    "accuracy": ("accuracy", 1, 3),
+}  # fmt: skip
+
+
+def seeds_rendered(result: Any) -> Iterator[list[str]]:
+    """Means and deviations over trainings of rendered objects, the released model, the best control."""
+    yield ["", f"{len(result['rows'])} seeds", "released", "best control"]
+    for column, released in result["released"].items():
+        images, _, key = column.partition(" ")
+        if key in RENDERED:
+            name, times, digits = RENDERED[key]
+            values = spread([times * row[column] for row in result["rows"]], digits)
+            others = (f"{times * value:.{digits}f}" for value in (released, result["controls"][column]))
+            yield [f"{images}: {name}", values, *others]
