@@ -18,7 +18,7 @@ BUDGET = {  # lines, files
     "objectives": (600, 5), "postprocess": (951, 5), "scene": (847, 11), "demo": (452, 3),
     "renderers": (627, 8), "learn": (897, 5),
 }  # fmt: skip
-TOTAL = (36_742, 233)
+TOTAL = (36_745, 233)
 TEST_LINES = 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

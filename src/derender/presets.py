@@ -2,7 +2,8 @@
 
 `paper` is the paper's model; `faces` and `cats` are the same, as unsup3d's ranges for them are. `cars` has
 ranges for cars. `small` has a quarter of the widths (a sixteenth of the work) and trains on a CPU;
-`small-faces` starts from a bundled model. How each is trained is in training/presets.yaml.
+`small-faces` starts from a bundled model. `small-cars` has ranges for cars seen from above. How each is
+trained is in training/presets.yaml.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,10 +45,12 @@ class ModelSettings(Settings):
 
 
 _SMALL = ModelSettings(network=NetworkSettings(width=16, light_width=8))
+_FROM_ABOVE = SceneRanges(border_depth=1.08, diffuse=(0.5, 1.0), level_depth=True, lean_deg=35)
 MODEL_PRESETS: dict[str, ModelSettings] = {
     **dict.fromkeys(("paper", "faces", "cats"), ModelSettings()),
     "cars": ModelSettings(ranges=SceneRanges(border_depth=1.08, diffuse=(0.5, 1.0))),
     **dict.fromkeys(("small", "small-faces"), _SMALL),
+    "small-cars": _SMALL.model_copy(update={"ranges": _FROM_ABOVE}),
 }
 
 

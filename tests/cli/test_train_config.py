@@ -10,7 +10,7 @@ from derender.learn.plan import read_plan
 from derender.training.config import PRESETS, resolve
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "runs"
-RUNS = ["rendered-faces", "faces", "cars", "cars-colours"]
+RUNS = ["rendered-faces", "faces", "cars"]
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from derender.cli.runs import DryRun, OutRun, Resume, dry_run_shown, report_run,
 from derender.storage.places import bundled_renderers
 
 MODEL = "Instead of derender: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris."
-PRESET = "faces (default with a graphics card), cars, cats, paper, small (default without) or small-faces."
+PRESET = "faces (default on a graphics card), small (else), small-faces, small-cars, cars, cats or paper."
 START_FROM = "Begin with a trained model's weights: a run folder, a bundled name or a Hub id."
 RENDERER = f"How scenes make images: {', '.join(bundled_renderers())}, or several joined by +."
 

@@ -34,8 +34,8 @@ def run_settings(
     Args:
         out: the run folder; with ``resume`` and nothing else the run keeps its own settings.
         model: "derender", or a baseline: vqvae, simclr, ae, beta-vae, resnet18, stylegan2, e4e or ris.
-        preset: faces (the default with a graphics card or ``start_from``), cars, cats, paper, small (the
-            default on a CPU) or small-faces; with ``resume`` the run's own.
+        preset: faces (the default with a graphics card or ``start_from``), small (else), small-faces,
+            small-cars, cars, cats or paper; with ``resume`` the run's own.
         start_from: a trained model whose weights the run begins with.
         loocc: factors that are contrasted: "none", "all", or names such as "light+camera".
         renderer: how scenes make images: lambert (the default), lambert-shadow, phong, sh, haze, several
