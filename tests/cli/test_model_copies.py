@@ -120,15 +120,13 @@ def test_a_copy_with_u_nets_comes_with_its_errors(folder, tmp_path, numbers):
 @pytest.mark.parametrize(
     ("command", "setting", "message"),
     [
-        ("whiten", "direction=8", "whitening.directions"),
+        ("whiten", "direction=8", "whitening.directions"), ("whiten", "views=0", "greater than"),
         ("whiten", "pictures=0", "2 images or more"),
-        ("whiten", "views=0", "greater than"),
         ("refine", "image=8", "images"),
         ("refine", "rendered=1.5", "less than or equal to 1"),
-        ("unet", "precision=16", "precision"),
-        ("unet", "batch_size=1", "greater"),
+        ("unet", "precision=16", "precision"), ("unet", "batch_size=1", "greater"),
     ],
-)
+)  # fmt: skip
 def test_settings_that_make_no_sense_are_named(folder, tmp_path, capsys, command, setting, message):
     assert run(command, folder, tmp_path / "mine", setting) == 2
     assert message in capsys.readouterr().err

@@ -86,22 +86,14 @@ LISTED = (
 TABLE = {**images("a b/1.png", "ünï/2.png", "new\nline.png", "other.png"), "data.csv": LISTED}
 
 TREES = {
-    "utkface": UTKFACE,
-    "lfw": LFW,
-    "yaleb": YALE,
-    "celeba": {**ALIGNED, **ATTRIBUTES},
+    "utkface": UTKFACE, "lfw": LFW, "yaleb": YALE, "celeba": {**ALIGNED, **ATTRIBUTES},
     "celebamask": images("images/0.jpg", "images/1.jpg", "masks/0.png", "masks/1.png"),
-    "synface": SYNFACE,
-    "syncar": SYNCAR,
-    "synface_tracks": TRACKS,
-    "rafdb": RAF,
+    "synface": SYNFACE, "syncar": SYNCAR, "synface_tracks": TRACKS, "rafdb": RAF,
     "depth_pairs": images("train/image/1.png", "train/depth/1.png", "test/image/1.png", "test/depth/1.png"),
-    "shapenet_cars": {f"02958343/{file}": None for file in CARS},
-    "face_tracks": EPISODES,
-    "table": TABLE,
-    "classes": images("cats/1.png", "cats/2.png", "dogs/1.png"),
+    "shapenet_cars": {f"02958343/{file}": None for file in CARS}, "face_tracks": EPISODES,
+    "table": TABLE, "classes": images("cats/1.png", "cats/2.png", "dogs/1.png"),
     "folder": images("1.png", "a/2.png", "b/c/3.png"),
-}
+}  # fmt: skip
 
 
 def as_parquet() -> bytes:
@@ -325,14 +317,11 @@ def test_faults_of_addresses_archives_and_nested_columns(tree, tmp_path, encoded
         (["True", "no", "NO", ""], np.array([1, 0, 0, -1], np.int8)),
         (["1", "0", "2"], np.array([1, 0, 2], np.float32)),
         (["-1", "1.5e3", ""], np.array([-1, 1500, nan], np.float32)),
-        (["01", "2"], np.array(["01", "2"])),
-        (["16777217", "2"], np.array(["16777217", "2"])),
-        (["16777216", "2"], np.array([16777216, 2], np.float32)),
-        (["1", "inf"], np.array(["1", "inf"])),
-        ([" x ", "1"], np.array(["x", "1"])),
-        (["", ""], np.array(["", ""])),
+        (["01", "2"], np.array(["01", "2"])), (["16777217", "2"], np.array(["16777217", "2"])),
+        (["16777216", "2"], np.array([16777216, 2], np.float32)), (["1", "inf"], np.array(["1", "inf"])),
+        ([" x ", "1"], np.array(["x", "1"])), (["", ""], np.array(["", ""])),
     ],
-)
+)  # fmt: skip
 def test_what_a_column_is(cells, expected):
     result = label_column(cells)
     assert result.dtype.kind == expected.dtype.kind and result.itemsize >= expected.itemsize

@@ -135,12 +135,10 @@ def test_every_kind_of_image_comes_back_as_it_came(photo, model, tmp_path):
         ("image", np.zeros((80, 80, 3), np.int64), "int64"),
         ("image", np.full((80, 80, 3), np.nan), "not finite"),
         ("image", "no/such/file.jpg", "does not exist"),
-        ("yaw_deg", 90.0, "yaw_deg must lie between"),
-        ("pitch_deg", -91.0, "pitch_deg must lie between"),
-        ("strength", -1.0, "strength must be 0 or more"),
-        ("fit_steps", -1, "fit_steps must be 0 or more"),
+        ("yaw_deg", 90.0, "yaw_deg must lie between"), ("pitch_deg", -91.0, "pitch_deg must lie between"),
+        ("strength", -1.0, "strength must be 0 or more"), ("fit_steps", -1, "fit_steps must be 0 or more"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_is_refused_with_the_remedy(name, value, words, photo, model):
     with pytest.raises((ValueError, FileNotFoundError), match=words):
         derender.relight(**{"image": photo, "model": model, name: value})

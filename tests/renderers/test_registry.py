@@ -56,23 +56,19 @@ def test_a_model_of_before_renderers_loads_as_lambert(tmp_path):
         ("phon", "no renderer 'phon'; did you mean 'phong'"),
         ("phong(gama=2)", "no setting 'gama'; did you mean 'gamma'.*gamma, mean_diffuse"),
         ("phong(gamma=9)", r"gamma must lie in 1\.\.3, got 9"),
-        ("phong(gamma=high)", "gamma must be a float, got 'high'"),
-        ("lambert-shadow(softness_deg=0)", r"must lie in 0\.1\.\.45"),
+        ("phong(gamma=high)", "gamma must be a float, got 'high'"), ("phong+phong", "'phong' twice"),
+        ("lambert-shadow(softness_deg=0)", r"must lie in 0\.1\.\.45"), ("phong(", "cannot read the renderer"),
         ("lambert(gamma=1)", "has no setting 'gamma': it has none"),
-        ("phong+phong", "'phong' twice"),
         ("sh+lambert-shadow", "cannot be combined: each sets the light"),
-        ("phong(", "cannot read the renderer"),
         ("nothing.here:glow", "no renderer 'nothing.here:glow'.*PYTHONPATH"),
         ("yaml:dump", "'yaml:dump' is a function, not a derender.renderers.Renderer"),
-        ("this:x", "names a module of Python itself"),
-        ("numpy.f2py.__main__:x", "or a program"),
-        (".:x", "cannot read the renderer"),
-        ("..os:x", "cannot read the renderer"),
+        ("this:x", "names a module of Python itself"), ("numpy.f2py.__main__:x", "or a program"),
+        (".:x", "cannot read the renderer"), ("..os:x", "cannot read the renderer"),
         ("phong(gamma=" + "[" * 180 + ")", "more than 50 levels"),
         ("phong(gamma=" + "9" * 400 + ")", r"must lie in 1\.\.3, got inf"),
         ("phong(gamma=!!python/name:os.system)", "could not determine a constructor"),
     ],
-)
+)  # fmt: skip
 def test_a_name_that_is_none_says_what_to_write(name, message):
     with pytest.raises(ValueError, match=message):
         renderer_named(name)

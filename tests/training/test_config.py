@@ -37,8 +37,7 @@ def test_explicit_values_win_and_none_means_not_given():
     ("overrides", "message"),
     [
         (["lerning_rate=1"], "unknown setting 'lerning_rate'.*did you mean '(optimiser.)?learning_rate'"),
-        (["learning_rate"], "write key=value"),
-        (["learning_rate=fast"], "'optimiser.learning_rate'.*'fast'"),
+        (["learning_rate"], "write key=value"), (["learning_rate=fast"], "'optimiser.learning_rate'.*'fast'"),
         (["learning_rate=-1"], "'optimiser.learning_rate'.*greater than 0"),
         (["image_size=48"], "image_size must be one of 32, 64, 128, 256"),
         (["loocc=lite"], "'objective.loocc'"),
@@ -46,7 +45,7 @@ def test_explicit_values_win_and_none_means_not_given():
         (["betas=[1, 2"], "cannot read the value"),
         (["learning_rate=.nan"], "finite"),
     ],
-)
+)  # fmt: skip
 def test_bad_overrides_are_one_clear_sentence(overrides, message):
     with pytest.raises(ValueError, match=message) as caught:
         resolve("small", overrides)

@@ -83,6 +83,16 @@ def test_the_same_seed_distils_the_same_and_nothing_else_is_touched():
     assert any(not torch.equal(value, ours[name]) for name, value in other.items())
 
 
+def test_images_teach_no_camera_where_renderings_alone_do():
+    start, few = untrained("lambert", 8)
+    for fitted in (True, False):
+        how = changed(images=16, rendered=0, fitted_cameras=fitted)
+        made = distillation.refine(start, few, few, how).model
+        learned, cameras = made.nets["camera"].state_dict(), start.nets["camera"].state_dict()
+        kept = [torch.equal(learned[name], value) for name, value in cameras.items()]
+        assert not any(kept) if fitted else all(kept)
+
+
 def test_the_confidence_net_stays_and_the_linear_model_is_the_same(model, refined, images):
     theirs, ours = model.state_dict(), refined.model.state_dict()
     learned = tuple(f"nets.{row.name}." for row in model.factors)
@@ -174,7 +184,7 @@ def test_what_cannot_be_refined_is_named(model, images):
     with pytest.raises(ValueError, match="and one held out, got 16 of 64 and 0"):
         distillation.refine(model, images, images[:0])
     with pytest.raises(ValueError, match="cannot optimise scenes per image yet"):
-        distillation.refine(derender.load("cars-64"), images[:4], images[4:])
+        distillation.refine(model.without_features(), images[:4], images[4:])
 
 
 def test_weights_that_are_no_numbers_are_an_error(model, images):

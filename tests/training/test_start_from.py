@@ -10,7 +10,7 @@ from tests.training.conftest import assert_same_weights, noise_set
 from torch.nn.functional import avg_pool2d
 
 import derender
-from derender.data import ImageSet
+from derender.data import ImageSet, split_indices
 from derender.networks import NetworkSettings
 from derender.objectives.reconstruction import depth_smoothness
 from derender.postprocess import Features
@@ -18,6 +18,8 @@ from derender.scene.enlarge import doubled
 from derender.training import resolve, train
 from derender.training.config import with_changes
 from derender.training.derender_task import DerenderTask
+from derender.training.distillation import RefineConfig
+from derender.training.distillation import refine as distil
 from derender.training.features import fit_whitening
 
 NETWORK = ["image_size=32", "width=8", "light_width=4", "code_size=16"]
@@ -51,6 +53,24 @@ def test_ranges_may_be_changed_but_other_networks_cannot_take_the_weights(given)
     wider = resolve("small", [*BRIEF, "width=16"], start_from=str(given))
     with pytest.raises(ValueError, match=r"cannot start from .* has shape .*network settings"):
         DerenderTask(wider).build()
+
+
+def test_a_run_refined_at_last_is_one_that_is_refined_and_ends_so_again_when_resumed(pictures, tmp_path):
+    few = [*BRIEF, "images=16", "whitening.pictures=8", "fitting.examples=32", "fitting.coordinates=4"]
+    plain, refined = (resolve("small", [*NETWORK, *few, f"rounds={n}", "refining.images=16"]) for n in (0, 2))
+    train(plain, pictures, tmp_path / "plain")
+    trained, split = derender.load(tmp_path / "plain"), split_indices(pictures.files, plain.split, seed=0)
+    shown, held_out = (torch.from_numpy(pictures.images[rows]) for rows in (split.train, split.validation))
+    how = RefineConfig(whitening=plain.whitening, fitting=plain.fitting, refining={"images": 16})
+    expected = distil(distil(trained, shown, held_out, how).model, shown, held_out, how).model.state_dict()
+    for resume in (False, True):
+        train(refined, pictures, tmp_path / "refined", resume=resume)
+        ended = derender.load(tmp_path / "refined")
+        assert ended.fitting and ended.whitening
+        assert all(torch.equal(value, expected[name]) for name, value in ended.state_dict().items())
+    assert any(not torch.equal(value, expected[name]) for name, value in trained.state_dict().items())
+    with pytest.raises(ValueError, match=r"'refining': refining needs maps_only=false"):
+        resolve("small", ["rounds=1", "maps_only=true"])
 
 
 def test_a_distilled_decoder_is_left_behind(tmp_path):

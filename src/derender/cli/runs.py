@@ -22,6 +22,7 @@ PHASES = {
     "train": ("training", "images"),
     "perceptual": ("perceptual features", "steps"),
     "features": ("whitening features", "images"),
+    "refining": ("refining", "images"),
     "scoring": ("scoring", "heads"),
 }
 

@@ -89,6 +89,14 @@ class FeatureSettings(Settings):
     brightness: bool = True  # estimate the prior that shares brightness between albedo and light
 
 
+class LastRefining(Settings):
+    """How a run ends: networks learn the scenes that optimisation finds, as by `derender refine`."""
+
+    rounds: int = Field(default=0, ge=0)  # each begins with scenes that are optimised anew
+    images: int = Field(default=60_000, ge=1)  # seen in each
+    fitted_cameras: bool = True  # as in RefiningSettings
+
+
 class OptimiserSettings(Settings):
     """Adam with weight decay, after a linear warm-up; ``final_rate`` < 1 lets it fall along a cosine."""
 
@@ -149,12 +157,21 @@ class TrainConfig(LoopSettings):
     whitening: WhiteningSettings = WhiteningSettings()
     fitting: FittingSettings = FittingSettings()
     brightness: bool = True  # as in FeatureSettings
+    refining: LastRefining = LastRefining()
 
     @field_validator("model")
     @classmethod
     def _without_decoder(cls, value: ModelSettings) -> ModelSettings:
         if value.network.unet_decoder:
             raise ValueError("network.unet_decoder: rendering trains none, derender unet distils one")
+        return value
+
+    @field_validator("refining")
+    @classmethod
+    def _refinable(cls, value: LastRefining, given: Any) -> LastRefining:
+        fitting = given.data.get("fitting")
+        if value.rounds and fitting is not None and (given.data.get("maps_only") or fitting.examples < 2):
+            raise ValueError("refining needs maps_only=false and fitting.examples=2 or more")
         return value
 
     @property

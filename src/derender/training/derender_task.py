@@ -19,10 +19,11 @@ from derender.objectives.self_features import load_self_features, train_self_fea
 from derender.postprocess import Features
 from derender.postprocess.whitening import Whitening
 from derender.storage.atomic import DamageNoticed
-from derender.storage.folder import write_config
+from derender.storage.folder import SplitRecord, write_split
 from derender.training.batches import some_of
 from derender.training.checkpoint import fit_weights
 from derender.training.config import ObjectiveSettings, TrainConfig
+from derender.training.distillation import RefineConfig, refine
 from derender.training.distributed import ALONE, Ranks, this_rank_writes
 from derender.training.features import make_features
 from derender.training.held_out_errors import store_errors
@@ -54,14 +55,24 @@ def train(
             device = "cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu"
             split = split_indices(images.files, config.split, seed=config.seed)
             mapped = isinstance(images.images, np.memmap)
+            held_out = images.images[split.validation[:MAX_VALIDATION_IMAGES]]
             some = torch.from_numpy(some_of(images.images, split.train, mapped=mapped))
             phase, trained = Progress.of("features", report), load(folder.model, device=device)
             with deterministic_algorithms(config.deterministic):
                 model = make_features(trained, some, config.features, seed=config.seed, progress=phase)
-                write_config(folder.model, [factor.name for factor in model.factors], model.settings)
-                model.features.save(folder.model)
-                store_errors(folder.model, images.images[split.validation[:MAX_VALIDATION_IMAGES]])
+                phase, few = Progress.of("refining", report), torch.from_numpy(held_out)
+                lessons = few if len(few) else some[:1], _refine_config(config)
+                for _ in range(config.refining.rounds):
+                    model = refine(model, some, *lessons, seed=config.seed, progress=phase).model
+                model.save(folder.model, overwrite=True)
+                write_split(folder.model, SplitRecord(config.split, config.seed))
+                store_errors(folder.model, held_out)
     return result
+
+
+def _refine_config(config: TrainConfig) -> RefineConfig:
+    features = config.features.model_dump(exclude={"perturb"})  # refining has wider ranges of its own
+    return RefineConfig(**features, refining=config.refining.model_dump(exclude={"rounds"}))
 
 
 @dataclass(frozen=True)

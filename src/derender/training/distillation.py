@@ -69,6 +69,7 @@ class RefiningSettings(StudentSettings):
     rendered: float = Field(default=0.5, ge=0, le=1)  # share of a batch that are renderings
     exchanged: float = Field(default=0.5, ge=0, le=1)  # share of those with another's geometry
     picture_weight: float = Field(default=1.0, ge=0)  # of the reconstruction error
+    fitted_cameras: bool = True  # images teach their fitted cameras; False: renderings alone teach cameras
     reframed: float = Field(default=0.0, ge=0, le=1)  # share of a batch that is shown in other crops
     strange: float = Field(default=0.5, ge=0, le=1)  # share of those with another image beyond their edge
 
@@ -182,8 +183,10 @@ def _learn(
         shown = as_float(images[rows]).to(student.device)
         shown, target = examples(student, shown, fitted.rows(rows).scene(maps), config, generator)
         predicted = student.decompose(shown)
-        total = unit.distance(predicted, target)
         photographs = slice(round(len(rows) * settings.rendered), None)  # renderings have exact scenes
+        if not settings.fitted_cameras:
+            target.camera[photographs] = predicted.camera[photographs].detach()
+        total = unit.distance(predicted, target)
         if settings.picture_weight and len(shown[photographs]):
             again = student.render(predicted[photographs])
             error = masked_l1(again.image, shown[photographs], again.mask.detach())

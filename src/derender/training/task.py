@@ -101,8 +101,8 @@ class Progress:
     """Where a run stands, for a progress bar.
 
     ``phase`` is "perceptual" while perceptual features are learnt (``done`` of ``total`` are steps), "train",
-    then "features" (images). ``terms`` are the latest losses; ``waiting`` is the share of time, 0..1, spent
-    waiting for images.
+    then "features" and "refining" (images). ``terms`` are the latest losses; ``waiting`` is the share of
+    time, 0..1, spent waiting for images.
     """
 
     phase: str

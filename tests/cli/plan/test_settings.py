@@ -79,11 +79,7 @@ label = "identity"
     ("old", "new", "told"),
     [
         ("images: 1000", "image: 1000", "unknown setting 'image'; did you mean 'images'"),
-        (
-            "small vqvae: {kind: vqvae",
-            "x: {kind: vqvea",
-            "unknown kind of method 'vqvea'; did you mean 'vqvae'",
-        ),
+        ("small vqvae: {kind: vqvae", "x: {kind: vqvea", "method 'vqvea'; did you mean 'vqvae'"),
         ("like: ours", "like: our", "unknown like 'our'; did you mean 'ours'"),
         ("width: 416", "widht: 416", "unknown setting 'widht'; did you mean 'model.width'"),
         ("width: 416", "seed: 3", "seed is the plan's own"),
@@ -93,11 +89,7 @@ label = "identity"
         ("table: identity", "table: identities", "Input should be 'clustering', 'identity'"),
         ("table: identity", "table: segmentation", "got 'segmentation'"),
         ("table: identity", "table: identity, label: x", "needs a table (identity, emotion, ...) or a label"),
-        (
-            "trained_on: faces",
-            "trained_on: faces, part: test",
-            "needs seeds: 1 and the data, dataset and limit of 'faces'",
-        ),
+        ("trained_on: faces", "trained_on: faces, part: test", "data, dataset and limit of 'faces'"),
         ("data: lfw.zip", "data: faces.zip, part: test", "needs seeds: 1 and the data"),
         ("  lfw:", "  ../lfw:", "String should match pattern"),
         ("  hog:", "  hog: {settings: {a: 1}}", "(hog) is not trained here"),

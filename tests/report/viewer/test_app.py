@@ -126,17 +126,15 @@ def test_no_path_is_served(client, path):
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({}, "picture"),
-        ({"picture": "../../../../etc/passwd"}, "pattern"),
+        ({}, "picture"), ({"picture": "../../../../etc/passwd"}, "pattern"),
         ({"picture": "a" * 22, "file": "/etc/passwd"}, "file"),
-        ({"picture": "a" * 22, "size": 100_000}, "size"),
-        ({"picture": "a" * 22, "size": "64"}, "size"),
+        ({"picture": "a" * 22, "size": 100_000}, "size"), ({"picture": "a" * 22, "size": "64"}, "size"),
         ({"picture": "a" * 22, "swaps": {"pose": "a" * 22}}, "swaps"),
         ({"picture": "a" * 22, "light": {**LIGHT, "yaw_deg": 1e9}}, "yaw_deg"),
         ({"picture": "a" * 22, "light": {**LIGHT, "ambient": float("nan")}}, "ambient"),
         ({"picture": "a" * 22, "camera": {**FRONT, "translation": [0, 0]}}, "translation"),
     ],
-)
+)  # fmt: skip
 def test_a_question_that_makes_no_sense_is_told_so(client, asked, words):
     reply = client.post("/api/view", asked)
     assert reply.status == 422
