@@ -88,7 +88,7 @@ SUMMARY = (
         "depth of generated cars, SIDE x 100 (low)",
         "{heads|`cars-64`, generated cars|SIDE x 100}",
         "average depth {heads|average depth of cars (control)|SIDE x 100}",
-        "the control wins",
+        "nothing",
     ),
 )
 
