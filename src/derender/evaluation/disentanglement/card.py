@@ -25,7 +25,7 @@ from derender.evaluation.disentanglement.similarity import (
     pearson,
     similarity,
 )
-from derender.evaluation.disentanglement.swap import SwapScores, swap_test, unexchanged
+from derender.evaluation.disentanglement.swap import SwapScores, swap_test
 from derender.evaluation.options import Options
 from derender.evaluation.score_table import Column, Interval, Row, Scores, ScoreTable, interval_column
 from derender.features import embed_images, model_fingerprint
@@ -87,8 +87,8 @@ class FeatureScores:
 class DisentanglementCard:
     """A model of some named ``features`` beside its controls, on ``n_pictures`` images.
 
-    ``rows`` has one result per seed of the model and each control: seeds change folds, donors, the images of
-    the swap test and random controls. ``correlations`` is (sum of D, sum of D), |correlation| between all
+    ``rows`` has one result per seed of the model and each control: seeds change folds and controls; the swap
+    test's images and donors are the same. ``correlations`` is (sum of D, sum of D), |correlation| between all
     dimensions; ``dimensions`` are the lengths of the features.
     """
 
@@ -179,7 +179,7 @@ def disentangle(
             are factors of a rendered scene (``true_factors``) bring the scores against ground truth.
         seeds: one result each.
         dimensions: importances of the scores by dimension, "lasso"; None leaves these scores out.
-        swap_images: at most so many images, a random subset for each seed, go through the swap test.
+        swap_images: at most so many images, drawn with the first seed, go through the swap test.
         batch_size: images at a time; changes speed and memory only.
         options: limit, device, cache, progress: fields of ``Options``.
 
@@ -207,31 +207,31 @@ def disentangle(
 
     components = max(len(sizes), min(64, len(images) // 4))
     whitened = cache(partial(pca_features, images, components=components))
-    orders = {seed: np.random.default_rng(seed).permutation(len(pixels)) for seed in seeds}
-    swapped = {seed: np.sort(order[:swap_images]) for seed, order in orders.items()}
-    tested = np.unique(np.concatenate(list(swapped.values())))  # whose encodings all seeds share
-    encoded = cache(partial(unexchanged, model, pixels[tested], batch_size=batch_size))
+    drawn = np.sort(np.random.default_rng(seeds[0]).permutation(len(pixels))[:swap_images])
+
+    def swapped(net: Any, blocks: Mapping[str, np.ndarray]) -> SwapScores:
+        known = {name: values[drawn] for name, values in blocks.items()}
+        return swap_test(net, pixels[drawn], seed=seeds[0], batch_size=batch_size, known=known)
+
+    own_swap = cache(lambda: swapped(model, features()))
 
     def made(row: str, seed: int) -> FeatureScores:
-        swap, truth, net = None, None, model if row == MODEL else None
-        if row == "untrained encoder":
+        swap, truth = None, None
+        if row == MODEL:
+            blocks, swap = features(), own_swap()
+        elif row == "untrained encoder":
             net = untrained_twin(model, seed)
             blocks = embed_images(net, pixels, batch_size=batch_size)
+            swap = swapped(net, blocks)
         elif row == "random pixels":
-            drawn = dealt(pixels.reshape(len(pixels), -1), list(sizes.values()), seed)
-            blocks = {name: part.astype(np.float32) / 255 for name, part in zip(sizes, drawn, strict=True)}
+            chosen = dealt(pixels.reshape(len(pixels), -1), list(sizes.values()), seed)
+            blocks = {name: part.astype(np.float32) / 255 for name, part in zip(sizes, chosen, strict=True)}
         elif row == "PCA":
             values = whitened().concatenate()
             equal = [len(part) for part in np.array_split(values[0], len(sizes))]
             blocks = dict(zip(sizes, dealt(values, equal, seed), strict=True))
         else:
-            blocks = features() if row == MODEL else shuffled_rows(features(), seed)
-        if net is not None:
-            chosen, known = swapped[seed], None
-            if net is model:
-                places = np.searchsorted(tested, chosen)
-                known = [{key: each[places] for key, each in one.items()} for one in encoded()]
-            swap = swap_test(net, pixels[chosen], seed=seed, batch_size=batch_size, known=known)
+            blocks = shuffled_rows(features(), seed)
         if len(factors) >= 2:
             truth = ground_truth.ground_truth_scores(blocks, factors, dimensions=dimensions, seed=seed)
         return FeatureScores(pearson(blocks), similarity(blocks, seed=seed), truth, swap)
@@ -240,7 +240,7 @@ def disentangle(
     rows: dict[str, list[FeatureScores]] = {name: [] for name in names}
     for seed in seeds:
         for name, result in rows.items():
-            keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap_pictures": swap_images}
+            keys = {"row": name, "seed": seed, "dimensions": dimensions, "swap": [swap_images, seeds[0]]}
             make = partial(made, name, seed)
             result.append(kept.recall_value("card", {**inputs, **keys}, FeatureScores, make))
             if how.progress is not None:

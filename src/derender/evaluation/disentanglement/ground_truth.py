@@ -12,6 +12,7 @@ All are 0..1 and best at 1; uninformative features score about 0. True factors a
 set: numbers, or names as classes.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -194,8 +195,9 @@ def dci(weights: np.ndarray) -> tuple[float, float]:
 
 def mutual_information(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Mutual information in nats between each column of (N, D) integers and (N,) integers: (D,)."""
-    table = np.zeros((a.shape[1], int(a.max()) + 1, int(b.max()) + 1))
-    np.add.at(table, (np.arange(a.shape[1]), a, b[:, None]), 1 / len(b))
+    shape = a.shape[1], int(a.max()) + 1, int(b.max()) + 1
+    cells = np.ravel_multi_index((np.arange(shape[0]), a, b[:, None]), shape)
+    table = np.bincount(cells.ravel(), minlength=math.prod(shape)).reshape(shape) / len(b)
     sides = entr(table.sum(axis=2)).sum(axis=1) + entr(table.sum(axis=1)).sum(axis=1)
     return sides - entr(table).sum(axis=(1, 2))
 

@@ -7,8 +7,8 @@ the N images. Shuffled rows score about sqrt(2 / (pi (N - 1))).
 
 CKA: Kornblith et al., ICML 2019; unbiased with the HSIC estimator of Song et al., JMLR 2012. The biased form
 is far from 0 for independent features of many dimensions. Cross-prediction: ridge regression from one feature
-to another, held out; every target gets the penalty with the smallest leave-one-out error. No low number
-proves disentanglement: read them beside the swap test (swap.py).
+to another, held out; every target gets its own penalty by generalised cross-validation. No low number proves
+disentanglement: read them beside the swap test (swap.py).
 """
 
 from collections.abc import Mapping
@@ -123,8 +123,8 @@ def held_out(x: np.ndarray, y: np.ndarray, *, folds: int = 5, seed: int = 0) -> 
 def fit_predict(x: np.ndarray, y: np.ndarray, x_new: np.ndarray) -> np.ndarray:
     """Ridge with an intercept from (N, D) to (N, T), applied to (M, D): (M, T) predictions.
 
-    ``PENALTIES`` are relative to the mean squared singular value of the centred features that is not 0. Of a
-    target's own one the leave-one-out error is the smallest; only that error is computed in float32.
+    ``PENALTIES`` are relative to the mean squared singular value of the centred features that is not 0. Each
+    target gets its own one by generalised cross-validation (Golub et al., Technometrics 1979).
     """
     mean, centre = y.mean(axis=0), x.mean(axis=0)
     apart, centred = y - mean, x - centre
@@ -138,12 +138,9 @@ def fit_predict(x: np.ndarray, y: np.ndarray, x_new: np.ndarray) -> np.ndarray:
     along = left.T @ apart
     penalties = np.array(PENALTIES)[:, None] * power.mean()
     shrunk = penalties / (power + penalties)  # (penalties, directions): shares of ``along`` that are left
-    unseen = np.maximum(1 - 1 / len(x) - np.square(left).sum(axis=1), 0) + shrunk @ np.square(left).T
-    rest, rows, parts = (each.astype(np.float32) for each in (apart - left @ along, left, along))
-    errors = [
-        np.square((rest + (rows * each) @ parts) / own[:, None]).sum(axis=0)
-        for each, own in zip(shrunk.astype(np.float32), unseen.astype(np.float32), strict=True)
-    ]
+    unseen = np.maximum(1 - 1 / len(x) - (1 - shrunk).sum(axis=1) / len(x), 1e-12)
+    rest = np.square(apart).sum(axis=0) - np.square(along).sum(axis=0)
+    errors = (np.square(shrunk) @ np.square(along) + rest) / np.square(unseen)[:, None]
     kept = 1 - shrunk[np.argmin(errors, axis=0)].T
     return mean + ((x_new - centre) @ centred.T) @ (left @ (kept * along / power[:, None]))
 

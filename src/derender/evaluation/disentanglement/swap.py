@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from derender.data import as_float
 from derender.evaluation.bootstrap import RESAMPLES, resamples
@@ -74,33 +75,31 @@ def encodings(
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 
-def unexchanged(model: Any, images: np.ndarray, *, batch_size: int = 64) -> tuple[Encodings, Encodings]:
-    """Of (N, 3, H, W) uint8 images and of their renderings: what `swap_test` needs whoever the donors are."""
-    inputs = encodings(model, images, batch_size=batch_size)
-    return inputs, encodings(model, images, _decoded(inputs), batch_size=batch_size)
-
-
 def swap_test(
     model: Any, images: np.ndarray, *, seed: int = 0, batch_size: int = 64,
-    known: Sequence[Encodings] | None = None,
+    known: Mapping[str, np.ndarray] | None = None,
 ) -> SwapScores:  # fmt: skip
     """The swap test of a ``Derenderer`` on (N, 3, H, W) uint8 images, two or more; ``seed`` draws donors.
 
-    ``known`` is what `unexchanged` gives of these images; by default it is computed.
+    ``known`` are the images' features by name, each (N, D); by default they are computed.
     """
     if len(images) < 2:
         raise ValueError(f"the swap test needs two images or more, got {len(images)}")
     features = [f"feature {factor.name}" for factor in model.factors]
     parameters = [factor.parameter for factor in model.factors]
     donor = derangement(len(images), torch.Generator().manual_seed(seed))
-    inputs, plain = known or unexchanged(model, images, batch_size=batch_size)
-    scene = _decoded(inputs)
+    inputs = encodings(model if known is None else model.without_features(), images, batch_size=batch_size)
+    inputs |= {f"feature {name}": torch.from_numpy(rows) for name, rows in (known or {}).items()}
+    stored = (key for key in inputs if key.startswith("parameter "))
+    scene = Scene.from_parameters({key.removeprefix("parameter "): inputs[key] for key in stored})
+    plain = encodings(model, images, scene, batch_size=batch_size)
     exchanged = [scene.with_parameters(**{name: scene.parameters[name][donor]}) for name in parameters]
     swapped = [encodings(model, images, one, batch_size=batch_size) for one in exchanged]
     donors = {key: each[donor] for key, each in plain.items()}
     apart = _distances(plain, donors)
     unit = {key: each.mean() or np.nan for key, each in apart.items()}
-    moves, left = ([_distances(each, other) for each in swapped] for other in (plain, donors))
+    moves = [_distances(each, plain) for each in swapped]
+    left = [_distances({key: each[key] for key in features}, donors) for each in swapped]
     weights = np.concatenate(list(resamples(len(images), RESAMPLES))).astype(np.float64)
 
     def matrix(keys: Sequence[str]) -> tuple[np.ndarray, Any]:
@@ -127,11 +126,6 @@ def swap_test(
     )
 
 
-def _decoded(inputs: Encodings) -> Scene:
-    stored = (key for key in inputs if key.startswith("parameter "))
-    return Scene.from_parameters({key.removeprefix("parameter "): inputs[key] for key in stored})
-
-
 def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
     """Mean of the diagonal over that of the other cells of (F, F, ...) matrices. Infinite where these are 0,
     NaN where all or any are NaN."""
@@ -141,4 +135,5 @@ def diagonal_over_rest(moved: np.ndarray) -> np.ndarray | np.floating:
 
 
 def _distances(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    return {key: (a[key].double() - b[key].double()).flatten(1).norm(dim=1).numpy(force=True) for key in a}
+    apart = {key: (a[key] - b[key]).flatten(1) for key in a}
+    return {key: vector_norm(each, dim=1, dtype=torch.float64).numpy() for key, each in apart.items()}
