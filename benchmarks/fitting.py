@@ -25,7 +25,7 @@ from derender.evaluation.truth import geometry_scores
 from derender.postprocess import embedding, fitting
 
 MODEL, PLAIN_STEPS = "rendered-faces-64", 60
-PLAIN = {"_STEP": 1.0, "_MOMENTUM": (0.9, 0.95), "_LATE": 0.6}
+PLAIN = {"_STEP": 1.0, "_MOMENTUM": (0.9, 0.95), "_LATE": 0.6, "_BLOCK": 4}
 WAYS = {
     "plain, portions of 4": (True, embedding.FEW),
     "plain": (True, embedding.MOST),

@@ -14,10 +14,14 @@ def training_step(result: Any) -> Iterator[list[str]]:
 
 def step_profile(result: Any) -> Iterator[list[str]]:
     runs = result["rows"]
-    yield ["share of a step's processor time", *(f"`{run['preset']}`, {run['size']} px" for run in runs)]
+    names = {"32-true": "", "bf16-mixed": ", bfloat16"}
+    heads = (f"`{run['preset']}`, {run['size']} px{names[run['precision']]}" for run in runs)
+    yield ["share of a step's processor time", *heads]
     for part in sorted(runs[0]["shares"], key=runs[0]["shares"].__getitem__, reverse=True):
         yield [part, *(f"{run['shares'][part]:.1%}" for run in runs)]
     yield ["GFLOP a processor second", *(f"{run['gflop_per_cpu_s']:.0f}" for run in runs)]
+    ceilings = (result["fastest_convolution"][run["precision"]] for run in runs)
+    yield ["of the fastest convolution", *(f"{ceiling:.0f}" for ceiling in ceilings)]
 
 
 def rasterize(result: Any) -> Iterator[list[str]]:

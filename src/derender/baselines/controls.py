@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.ndimage import gaussian_filter
 from skimage import feature
 
@@ -143,7 +144,7 @@ def _luma(image: np.ndarray) -> np.ndarray:
 def untrained_twin(model: Any, seed: int) -> Any:
     """The same settings, factors and renderer with fresh weights; torch's global generator is left alone."""
     twin = type(model).seeded(model.settings, seed, factors=model.factors, renderer=model.renderer)
-    return twin.to(model.device).eval()
+    return twin.to(model.device, memory_format=torch.channels_last).eval()
 
 
 class Untrained:

@@ -201,11 +201,14 @@ class EmbeddingModel(nn.Module):
             return self.encode(images)
         return self.features_from(self.activations(images, codes=False))
 
-    def activations(self, images: Images, codes: bool = True) -> dict[str, Tensor]:
+    def activations(
+        self, images: Images, codes: bool = True, scenes: Scene | None = None
+    ) -> dict[str, Tensor]:
         """Encoder activations (N, D) of images in 0..1, by factor: the code, then the last spatial map.
 
         Where ``features`` needs them, the mirror image's follow, and the fitted scene's under
         `coordinates_of`. Without ``codes`` factors whose features take another crop or view lack theirs.
+        ``scenes``, where they are known, are what ``decode`` makes of the codes: fitting begins there.
         """
         check_images(images, self.image_size)
         framed, _ = self.framed(images)
@@ -213,7 +216,7 @@ class EmbeddingModel(nn.Module):
         result = {f.name: self.factor_activations(f.name, images, **known) for f in self.factors}
         if self.features.fits_scenes:
             steps = self.features.required_fitting().settings.steps
-            fitted = self._fitted(framed, steps).coordinates
+            fitted = self._fitted(framed, steps, scenes if framed is images else None).coordinates
             result |= {coordinates_of(name): value for name, value in fitted.items()}
         return result
 
@@ -276,19 +279,23 @@ class EmbeddingModel(nn.Module):
         fitted = self._fitted(framed, steps)
         return replace(fitted, scene=self.placed(fitted.scene, crops))
 
-    def _fitted(self, images: Images, steps: int) -> Fitted:
+    def _fitted(self, images: Images, steps: int, scenes: Scene | None = None) -> Fitted:
         fitting, nets = self.features.required_fitting(), self.nets
         rows = [row for row in self.factors if not (row.mirrored or row.parameter in ("light", "camera"))]
         ranged = [lambda raw, own=row: own.to_parameter(raw, self.settings.ranges) for row in rows]
         with torch.no_grad():
             typical = self.decode(self.encode(torch.full_like(images[:1], 0.5)))
 
-        def fitted(portion: Tensor) -> Fitted:
+        def fitted(places: Tensor) -> Fitted:
+            portion, raws = images[places].contiguous(), list[Tensor]()
             few = len(portion) if portion.is_cuda else FEW
-            with torch.no_grad():
-                codes = [self.encode(part) for part in portion.split(few)]
-                scene = Scene.joined([self.decode(one) for one in codes])
-                raws = [torch.cat([nets[row.name].decoder(one[row.name]) for one in codes]) for row in rows]
+            if scenes is None or rows:
+                with torch.no_grad():
+                    codes = [self.encode(part) for part in portion.split(few)]
+                    scene = Scene.joined([self.decode(one) for one in codes])
+                    raws = [torch.cat([nets[r.name].decoder(one[r.name]) for one in codes]) for r in rows]
+            else:
+                scene = scenes[places]
             further = list(zip([row.parameter for row in rows], raws, ranged, strict=True))
             return fitting.fit(portion, scene, self.render, steps, further, typical)
 
@@ -334,15 +341,15 @@ def gradient_histograms(images: Images) -> Float[Tensor, "n histograms"]:
 
 
 def _by_portions(function: Callable[[Tensor], Fitted], images: Images) -> list[Fitted]:
-    """Results of portions of images in order, the last one filled up to fours with its last image.
+    """Results for the places of portions of images in order, the last one filled up to fours with the last.
 
     The function is called by as many threads as torch has, each with one of torch's; on a GPU once, with all.
     """
+    count, threads = len(images), torch.get_num_threads()
     if images.is_cuda:
-        return [function(images)]
-    missing, threads = -len(images) % FEW, torch.get_num_threads()
-    images = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
-    portions = images.contiguous().split(min(FEW * math.ceil(len(images) / FEW / threads), MOST))
+        return [function(torch.arange(count, device=images.device))]
+    filled = torch.arange(count + -count % FEW).clamp(max=count - 1)
+    portions = filled.split(min(FEW * math.ceil(count / FEW / threads), MOST))
     try:
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             return list(pool.map(function, portions))

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field, ValidationError, model_validator
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from derender.render import Rendering
 from derender.scene import Scene
@@ -38,6 +39,7 @@ _TYPICAL = ((0.4, -0.6, -0.15, 0.35), (-0.4, 0.6, 0.15, -0.35))
 """Pitch and yaw of the light and of the camera (radians) where the steepness of the loss is measured."""
 _NEAR = 4.0  # differences that measure it: half a standard deviation, 0.04 radians
 NOISE = 0.03  # mean absolute error, 0..1, that counts as much as coordinates, or a distilled gap, of 1
+_BLOCK = 16  # rows of a product; with fewer it waits for memory
 _BEYOND = 0.1  # what an error beyond the tolerance still counts
 
 
@@ -100,13 +102,13 @@ class MorphableMaps(nn.Module):
     def maps(self, name: str, coordinates: Float[Tensor, "n k"]) -> Float[Tensor, "n ..."]:
         """The maps that coordinates stand for."""
         mean, axes = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_axes")
-        return mean + by_fours(coordinates, axes.flatten(1)).unflatten(1, mean.shape)
+        return mean + in_blocks(coordinates, axes.flatten(1)).unflatten(1, mean.shape)
 
     def coordinates(self, name: str, maps: Float[Tensor, "n ..."]) -> Float[Tensor, "n k"]:
         """Of the nearest map the model has; an axis without length has coordinate 0."""
         mean, axes = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_axes").flatten(1)
         squared = axes.square().sum(dim=1)
-        result = by_fours((maps - mean).flatten(1), axes.T)
+        result = in_blocks((maps - mean).flatten(1), axes.T)
         return torch.where(squared > 0, result / squared.clamp(min=torch.finfo(squared.dtype).tiny), 0.0)
 
 
@@ -128,9 +130,12 @@ def _principal(centred: Float[Tensor, "n d"], count: int) -> tuple[Float[Tensor,
     return (variances.clamp(min=0) / rows).sqrt().to(centred), directions.to(centred)
 
 
-def by_fours(rows: Float[Tensor, "n k"], matrix: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
-    """Products of four rows at a time: on a CPU rounding depends on their number, and steps magnify it."""
-    return rows @ matrix if rows.is_cuda else torch.cat([part @ matrix for part in rows.split(4)])
+def in_blocks(rows: Float[Tensor, "n k"], matrix: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
+    """Products of 16 rows at a time, with zeros below: rounding depends on their number, steps magnify it."""
+    if rows.is_cuda:
+        return rows @ matrix
+    filled = pad(rows, (0, 0, 0, -len(rows) % _BLOCK))
+    return torch.cat([part @ matrix for part in filled.split(_BLOCK)])[: len(rows)]
 
 
 @dataclass(frozen=True)
@@ -245,11 +250,11 @@ class Fitting(nn.Module):
                 held = ((moved <= low / rates) & (gradient > 0)) | ((moved >= high / rates) & (gradient < 0))
                 gradient, along = gradient.masked_fill(held, 0.0), torch.zeros_like(moved)
                 torch.ops.aten._fused_adam_(  # torch.optim first imports the compiler, for a second
-                    [along], [by_fours(gradient, directions)], [mean], [square], [], [count], lr=rate * _STEP,
-                    beta1=_MOMENTUM[0], beta2=_MOMENTUM[1], eps=1e-8, weight_decay=0.0, amsgrad=False,
-                    maximize=False,
+                    [along], [in_blocks(gradient, directions)], [mean], [square], [], [count],
+                    lr=rate * _STEP, beta1=_MOMENTUM[0], beta2=_MOMENTUM[1], eps=1e-8, weight_decay=0.0,
+                    amsgrad=False, maximize=False,
                 )  # fmt: skip
-                step_to = by_fours(along, directions.T).masked_fill(held, 0.0)
+                step_to = in_blocks(along, directions.T).masked_fill(held, 0.0)
                 moved = (moved.detach() + step_to).clamp(low / rates, high / rates)
         with torch.no_grad():
             fitted, rendering, result = rendered(moved, scene.extra)

@@ -58,7 +58,7 @@ def disentangle(
     seeds: int = scoring.number(3, "Number of seeds.", max=20),
     swap_pictures: int = scoring.number(256, "Most images in the swap test.", min=2),
     dimensions: Literal["lasso", "none"] = option("lasso", "Scores by dimension: lasso or none."),
-    batch_size: options.BatchSize = 64, seed: options.Seed = 0, cache: scoring.Cache = None,
+    batch_size: options.BatchSize = 128, seed: options.Seed = 0, cache: scoring.Cache = None,
 ) -> None:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, swap test; on rendered data DCI, MIG, SAP."""
     published.check(out, ends=[".png"])

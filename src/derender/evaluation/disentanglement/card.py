@@ -169,7 +169,7 @@ class DisentanglementCard:
 
 def disentangle(
     model: Any, images: ImageSet | str | Path, *, seeds: Sequence[int] = (0, 1, 2),
-    dimensions: str | None = "lasso", swap_images: int = 256, batch_size: int = 64, **options: Any,
+    dimensions: str | None = "lasso", swap_images: int = 256, batch_size: int = 128, **options: Any,
 ) -> Scores:  # fmt: skip
     """Does each feature hold its own factor? Correlation, CKA, the swap test; on rendered data DCI, MIG, SAP.
 

@@ -142,7 +142,7 @@ def fit_predict(x: np.ndarray, y: np.ndarray, x_new: np.ndarray) -> np.ndarray:
     rest = np.square(apart).sum(axis=0) - np.square(along).sum(axis=0)
     errors = (np.square(shrunk) @ np.square(along) + rest) / np.square(unseen)[:, None]
     kept = 1 - shrunk[np.argmin(errors, axis=0)].T
-    return mean + ((x_new - centre) @ centred.T) @ (left @ (kept * along / power[:, None]))
+    return mean + ((x_new - centre) @ centred.T @ left) @ (kept * along / power[:, None])
 
 
 def side_by_side(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

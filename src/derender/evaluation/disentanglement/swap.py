@@ -67,8 +67,10 @@ def encodings(
             if scenes is not None:
                 result = model.render(scenes[rows].to(model.device))
                 pixels = fill_uncovered(result.image.float(), result.mask.float(), pixels)
-            activations = model.activations(pixels)
-            features, decoded = model.features_from(activations), model.decode(model.codes(activations))
+            start = model.decode(model.encode(pixels)) if model.features.fits_scenes else None
+            activations = model.activations(pixels, scenes=start)
+            features = model.features_from(activations)
+            decoded = start or model.decode(model.codes(activations))
             part = {f"parameter {name}": each for name, each in decoded.parameters.items()}
             part |= {"pixels": pixels, **{f"feature {f.name}": features[f.name] for f in model.factors}}
             parts.append({key: each.float().cpu() for key, each in part.items()})
