@@ -5,7 +5,7 @@ import pytest
 from sklearn.linear_model import Ridge
 
 from derender.evaluation.disentanglement import correlation_matrix, linear_cka, pearson, similarity
-from derender.evaluation.disentanglement.similarity import PENALTIES, fit_predict, held_out
+from derender.evaluation.disentanglement.similarity import CAUTION, PENALTIES, fit_predict, held_out
 
 
 def features(rows: int = 40, size: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
@@ -105,7 +105,7 @@ def test_ridge_regression_is_that_of_scikit_learn_with_the_penalty_of_each_targe
     y = x[:, :4] @ draw.normal(size=(4, 20)) + draw.normal(size=(50, 20))
     power = np.linalg.svd(x - x.mean(axis=0), compute_uv=False) ** 2
     fits = [Ridge(penalty).fit(x, y) for penalty in np.array(PENALTIES) * power[power > 1e-9].mean()]
-    left = [50 - 1 - (power / (power + fit.alpha)).sum() for fit in fits]  # degrees of freedom
+    left = [max(50 - CAUTION * (1 + (power / (power + fit.alpha)).sum()), 1e-99) for fit in fits]
     errors = [np.square(fit.predict(x) - y).sum(axis=0) / n**2 for fit, n in zip(fits, left, strict=True)]
     every = np.stack([fit.predict(x_new) for fit in fits])
     theirs = every[np.argmin(errors, axis=0), :, range(20)].T

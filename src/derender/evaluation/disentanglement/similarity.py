@@ -19,6 +19,7 @@ import numpy as np
 from derender.features.table import check_finite
 
 PENALTIES = tuple(10.0**power for power in range(-7, 3))
+CAUTION = 1.1  # what a degree of freedom counts; at 1 it is too little where there are as many as rows
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def fit_predict(x: np.ndarray, y: np.ndarray, x_new: np.ndarray) -> np.ndarray:
     along = left.T @ apart
     penalties = np.array(PENALTIES)[:, None] * power.mean()
     shrunk = penalties / (power + penalties)  # (penalties, directions): shares of ``along`` that are left
-    unseen = np.maximum(1 - 1 / len(x) - (1 - shrunk).sum(axis=1) / len(x), 1e-12)
+    unseen = np.maximum(1 - CAUTION * (1 + (1 - shrunk).sum(axis=1)) / len(x), 1e-99)  # none: never chosen
     rest = np.square(apart).sum(axis=0) - np.square(along).sum(axis=0)
     errors = (np.square(shrunk) @ np.square(along) + rest) / np.square(unseen)[:, None]
     kept = 1 - shrunk[np.argmin(errors, axis=0)].T
