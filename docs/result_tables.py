@@ -342,6 +342,7 @@ FILES: dict[str, tuple[str, Reader]] = SIDE_BY_SIDE | {  # files, the first for 
     "paper-gpu": ("paper-gpu.json", theirs.preset),
     "seeds": (" ".join(("seeds.json", *trained.SEEDED_FILES)), trained.seeds),
     "seeds-heads": ("seeds-heads.json", trained.seeds_rendered),
+    "seeds-cars": ("seeds-cars.json", trained.seeds_rendered),
     "ladder": (" ".join(("ladder.json generated/heads.json", *trained.LADDER_CONTROLS)), trained.ladder),
     "demo": ("demo.json", demo),
     "renderers": ("renderers_fit.json", drawn.renderers),
