@@ -96,18 +96,18 @@ def test_scenes_are_found_in_the_crop_and_their_cameras_move_back(model, heads):
         framed, crops = model.framed(images)
         scenes = model.decompose(images), model.fit_scenes(images, 2).scene
         inside = unframed.decompose(framed), unframed.fit_scenes(framed, 2).scene
-        error, before = (
-            float(masked_l1(again.image, images, again.mask))
-            for again in (model.render(scenes[0]), model.render(unframed.decompose(images)))
-        )
+        shown = [model.render(one) for one in (scenes[0], unframed.decompose(images))]
+        error, before = (float(masked_l1(one.image, images, one.mask)) for one in shown)
         coordinates = model.with_features(model.features.with_steps(2)).activations(images)
+        start, two = unframed.decode(unframed.encode(framed)), unframed.features.with_steps(2)
     assert not torch.equal(framed, images) and torch.equal(framed, model.whitening.framing(images))
     for scene, found in zip(scenes, inside, strict=True):
         assert torch.equal(scene.depth, found.depth) and torch.equal(scene.light, found.light)
         torch.testing.assert_close(crop_scene(scene, crops, model.fov_deg).camera, found.camera)
-    assert error < 0.95 * before
     fitted = unframed.fit_scenes(framed, 2).coordinates["geometry"]
-    assert torch.equal(coordinates[coordinates_of("geometry")], fitted)
+    assert error < 0.95 * before and torch.equal(coordinates[coordinates_of("geometry")], fitted)
+    begun = unframed.with_features(two).activations(framed, scenes=start)[coordinates_of("geometry")]
+    torch.testing.assert_close(begun, fitted, rtol=1e-3, atol=1e-3)
     assert torch.equal(model.canonical_view(images), model.frontal(framed))
 
 
