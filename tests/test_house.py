@@ -15,10 +15,10 @@ BUDGET = {  # lines, files
     "data": (6_480, 30), "evaluation": (6_689, 32), "report": (3_654, 21), "cli": (2_082, 28),
     "training": (3_485, 19), "baselines": (2_309, 11), "render": (1_660, 15), "features": (1_246, 8),
     "interpretation": (986, 5), "photo": (1_567, 7), "networks": (668, 5), "storage": (884, 7),
-    "objectives": (600, 5), "postprocess": (963, 5), "scene": (847, 11), "demo": (452, 3),
+    "objectives": (600, 5), "postprocess": (964, 5), "scene": (847, 11), "demo": (452, 3),
     "renderers": (627, 8), "learn": (897, 5),
 }  # fmt: skip
-TOTAL = (36_787, 233)
+TOTAL = (36_788, 233)
 TEST_LINES = 26_000
 LONGEST = {"model.py": 180}
 LONGEST_COMMAND = 80

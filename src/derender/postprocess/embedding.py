@@ -35,7 +35,7 @@ FEW, MOST = 4, 64  # images in one call of a network, and in a portion: large on
 CELLS = 32  # of gradient directions along each side
 BLUR_PX, SCALE = 0.75, 0.2  # blur before differences; near the variation of activations (development halves)
 _DARK = 1 / 510  # half a grey level: shorter gradients are noise
-HISTOGRAM_CELLS, ORIENTATIONS = 10, 12  # of histograms of gradients: along each side, and in each
+HISTOGRAM_CELLS, ORIENTATIONS = 16, 12  # of histograms of gradients: along each side, and in each
 HISTOGRAMS = HISTOGRAM_CELLS**2 * ORIENTATIONS
 Model = TypeVar("Model", bound="EmbeddingModel")
 Images = Float[Tensor, "n 3 h w"]
@@ -221,14 +221,14 @@ class EmbeddingModel(nn.Module):
         return result
 
     def factor_activations(
-        self, name: str, images: Images, gradients: bool | None = None,
+        self, name: str, images: Images, cells: int | None = None,
         framed: Images | None = None, codes: bool = True,
     ) -> Rows:  # fmt: skip
         """``activations`` for one factor, without coordinates.
 
         Where ``features`` take another crop or the canonical view, its activations follow the code, if
-        ``codes``. ``gradients``: followed by `gradient_directions` and `gradient_histograms`; by default
-        where ``features`` take them. ``framed`` are the images in their crops, if they are known.
+        ``codes``. With ``cells`` `gradient_directions` and `gradient_histograms` of so many along each side
+        follow; by default as ``features`` take them. ``framed`` are the images in their crops, if known.
         """
         net, parts = self.nets[name], list[Tensor]()
         framing, shown = self.features.framing(name), images
@@ -239,10 +239,11 @@ class EmbeddingModel(nn.Module):
         shown = reduced(shown, self.settings.network)
         for one in (shown, shown.flip(-1)) if self.features.mirrors(name) else (shown,):
             parts += [*code, activated := net.activations(one)]
-            if self.whitening is not None and name in self.whitening.names and gradients is None:
-                gradients = self.whitening.size(name) > activated.shape[1]
-            if gradients:
-                parts += [gradient_directions(one), gradient_histograms(one)]
+            if cells is None and self.whitening is not None and name in self.whitening.names:
+                rest = self.whitening.size(name) - activated.shape[1] - 2 * CELLS**2
+                cells = math.isqrt(max(rest, 0) // ORIENTATIONS)
+            if cells:
+                parts += [gradient_directions(one), gradient_histograms(one, cells)]
         return torch.cat(parts, dim=1)
 
     def surface(self, images: Images) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n 6"]]:
@@ -320,11 +321,11 @@ def gradient_directions(images: Images) -> Float[Tensor, "n directions"]:
     return SCALE * adaptive_avg_pool2d(unit, CELLS).flatten(1)
 
 
-def gradient_histograms(images: Images) -> Float[Tensor, "n histograms"]:
-    """Histograms of 12 orientations of the gradient of the mean of colours, in 10x10 cells.
+def gradient_histograms(images: Images, side: int = HISTOGRAM_CELLS) -> Float[Tensor, "n histograms"]:
+    """Histograms of 12 orientations of the gradient of the mean of colours, in ``side`` x ``side`` cells.
 
     Each is divided by the root mean square of its 3x3 neighbours, also where it is dark (after Dalal and
-    Triggs, CVPR 2005). Images are in 0..1, at least 10 pixels wide and high. Values lie within 0..0.4.
+    Triggs, CVPR 2005). Images are in 0..1, no narrower or lower than ``side``. Values lie within 0..0.4.
     """
     grey = pad(images.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate")
     right = grey[..., 1:-1, 2:] - grey[..., 1:-1, :-2]
@@ -335,7 +336,7 @@ def gradient_histograms(images: Images) -> Float[Tensor, "n histograms"]:
     along = (right * cosine + down * sine) / length
     for _ in range(6):  # to the power of 64, which falls to half between two orientations
         along = along.square()
-    cells = adaptive_avg_pool2d(length * along, HISTOGRAM_CELLS)
+    cells = adaptive_avg_pool2d(length * along, side)
     near = avg_pool2d(pad(cells.square().sum(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate"), 3, 1)
     return (cells / (near + 1e-10).sqrt()).clamp(max=0.4).flatten(1)
 

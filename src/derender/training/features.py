@@ -19,7 +19,7 @@ from torch import Generator, Tensor
 
 from derender.data import Progress
 from derender.model import Derenderer
-from derender.postprocess.embedding import HISTOGRAMS, Features
+from derender.postprocess.embedding import HISTOGRAM_CELLS, HISTOGRAMS, Features
 from derender.postprocess.fitting import PARAMETERS, Fitting, FittingSettings, MorphableMaps
 from derender.postprocess.whitening import Scatter, Whitening, fit_projection, fit_side_by_side
 from derender.scene.brightness import BrightnessPrior, brightness_cues
@@ -98,14 +98,14 @@ def fit_whitening(
     maps, vectors = ([f for f in model.factors if f.mirrored is which] for which in (True, False))
     names = [factor.name for factor in maps]
     gradients = settings.gradients and settings.spatial
-    described = {f.name for f in maps if gradients and f.parameter == "albedo"}
+    cells = {f.name: HISTOGRAM_CELLS * (gradients and f.parameter == "albedo") for f in maps}
     turns = settings.canonical and settings.spatial and "camera" in {f.parameter for f in vectors}
     turned = {f.name for f in maps if turns and f.parameter == "depth"}
 
     def activated(batch: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor]:
         batch = batch if framing is None else framing(batch)
         seen = dict.fromkeys(turned, model.frontal(batch)) if turned else {}
-        return {n: model.factor_activations(n, seen.get(n, batch), n in described) for n in names}
+        return {n: model.factor_activations(n, seen.get(n, batch), cells[n]) for n in names}
 
     encode = activated if settings.spatial else model.encode
     mirrored: dict[str, list[Scatter]] = {}
@@ -127,7 +127,7 @@ def fit_whitening(
                 _check_finite("whitening", own, start)
             for name in names:
                 joined = torch.stack([view[name].float() for view in views])
-                blocks = joined.tensor_split([-HISTOGRAMS] if name in described else [], dim=-1)
+                blocks = joined.tensor_split([-HISTOGRAMS] if cells[name] else [], dim=-1)
                 own = mirrored.setdefault(name, [Scatter() for _ in blocks])
                 for scatter, block in zip(own, blocks, strict=True):
                     scatter.add(block)
