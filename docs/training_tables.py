@@ -48,6 +48,10 @@ SEEDED = {
     "Yale B, 50 to 77 degrees": ("published/identity.json", "<= 77", "Yale B <= 77"),
     "Yale B, beyond": ("published/identity.json", "beyond", "Yale B beyond"),
     "Yale B, Ward accuracy": ("published/identity.json", "ward accuracy", "Yale B ward accuracy"),
+    "all 18 people, 25 to 50 degrees": ("published/identity-all.json", "<= 50", "Yale B, all <= 50"),
+    "all 18 people, 50 to 77 degrees": ("published/identity-all.json", "<= 77", "Yale B, all <= 77"),
+    "all 18 people, beyond": ("published/identity-all.json", "beyond", "Yale B, all beyond"),
+    "all 18 people, Ward": ("published/identity-all.json", "ward accuracy", "Yale B, all ward accuracy"),
 }
 SEEDED_FILES = tuple(dict.fromkeys(file for file, *_ in SEEDED.values()))
 
